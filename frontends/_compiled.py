@@ -13,7 +13,9 @@ def compiled(**options: Any) -> Callable[[Any], Any]:
     """Return a decorator like `numba.njit(**options)` that caches on disk where a folder is writable.
 
     A service without a home folder, with graphloc installed read-only, has none: it compiles at each start.
+    Nothing here is called from C: an entry for that takes a seventh of the compilation.
     """
+    options["no_cfunc_wrapper"] = True
 
     def compile_(function: Any) -> Any:
         try:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion
@@ -42,7 +42,7 @@ def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: A
         if step is None:
             return None
         value_s, sigma_s, blocks = value_s + step[0], *step[1:]
-        clear = max(_CLEAR, float(student.isf(_BY_CHANCE / 2.0, blocks - 1)))
+        clear = max(_CLEAR, -float(stdtrit(blocks - 1, _BY_CHANCE / 2.0)))
         if abs(value_s) > MOST_LATE_S:
             return None
     return (value_s, sigma_s) if abs(value_s) > max(clear * sigma_s, _LEAST_S) else None

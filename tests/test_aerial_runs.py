@@ -93,7 +93,7 @@ def test_one_match_is_drawn(
     ],
 )  # fmt: skip
 def test_a_matcher_that_cannot_work_is_one_line(changes: dict[str, Any], said: str, bag: Path) -> None:
-    recording, vessel = app.load([bag / "run"], bag / "vessel.yaml")
+    recording, vessel = loaded(bag)
     sensor = AerialConfig.model_validate({**vessel.sensors["aerial"].model_dump(), **changes})
     vessel = vessel.model_copy(update={"sensors": {**vessel.sensors, "aerial": sensor}})
     with pytest.raises(InputError) as caught:
@@ -104,8 +104,8 @@ def test_a_matcher_that_cannot_work_is_one_line(changes: dict[str, Any], said: s
 
 def test_an_image_of_elsewhere_leaves_rows_in_the_ledger(bag: Path, tmp_path: Path) -> None:
     picture(tmp_path / "far.tif", 32633, 0.5, np.array([40.0, -60.0, 60.0, -30.0]))
-    recording, vessel = app.load([bag / "run"], bag / "vessel.yaml")
-    sensor = vessel.sensors["aerial"].model_copy(update={"image": str(tmp_path / "far.tif")})
+    recording, vessel = loaded(bag)
+    sensor = vessel.sensors["aerial"].model_copy(update={"image": str(tmp_path / "far.tif"), "submap_s": 0.0})
     vessel = vessel.model_copy(update={"sensors": {**vessel.sensors, "aerial": sensor}})
     short = replace(recording, truth=None)
     run = app.smooth_recording(short, vessel, scans=app.Scans((bag / "run",), bag))
@@ -224,8 +224,11 @@ def test_where_windows_were_too_small_scans_are_matched_around_the_second_track(
     together = vessel.sensors["aerial"].model_copy(update={"submap_s": submap_s, "matcher": matcher})
     vessel = vessel.model_copy(update={"sensors": vessel.sensors | {"aerial": together}})
     lengths_s = []
-    fixes = tuple(m for m in recording.measurements if m.sensor == "gnss")
-    short, around = replace(recording, measurements=fixes), list[Solution]()
+    assert recording.imu is not None
+    until_ns = int(recording.imu.stamps_ns[0]) + 5 * S
+    imu = recording.imu.where(recording.imu.stamps_ns < until_ns)
+    fixes = tuple(m for m in recording.measurements if m.sensor == "gnss" and m.stamp_ns < until_ns)
+    short, around = replace(recording, measurements=fixes, imu=imu), list[Solution]()
 
     def faked(given: Recording, config: VesselConfig, _datum: Datum, solution: Solution, *_: object) -> Matches:
         assert sum(m.sensor == "gnss" for m in given.measurements) == len(fixes)  # whatever was found before
@@ -295,7 +298,7 @@ def test_a_hull_that_was_left_out_is_named(bag: Path, monkeypatch: pytest.Monkey
     for hull_m, expected in ((None, 0), ((), 1)):
         said: list[str] = []
         changes = {} if hull_m is None else {"hull_m": hull_m}
-        sensor, track = aerial(bag, every_m=0.0, **changes)
+        sensor, track = aerial(bag, every_m=0.0, submap_s=0.0, **changes)  # of each scan it is looked at alone, anyway
         list(matching(bag, track, sensor, warn=said.append))
         assert len(said) == expected
     box = np.array(json.loads(said[0].partition("at least hull_m: ")[2]))
@@ -441,7 +444,8 @@ def test_one_stamp_of_the_future_costs_one_match(bag: Path, monkeypatch: pytest.
     def sometimes(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
         return whole(msg, stamp_ns + (3600 * S if next(count) == 52 else 0), lidar)
 
-    sensor, track = aerial(bag, every_m=0.0, still_s=0.5)
+    lidars = {name: lidar for name, lidar in aerial(bag)[0].lidars.items() if name in ("lidar_3", "lidar_4")}
+    sensor, track = aerial(bag, every_m=0.0, still_s=0.5, lidars=lidars)
     usual = len(matched(bag, track, sensor))
     monkeypatch.setattr(scans, "decode_cloud", sometimes)
     found = matched(bag, track, sensor)

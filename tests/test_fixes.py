@@ -255,7 +255,7 @@ def test_a_fix_without_a_height_is_a_horizontal_one(every: int, tmp_path: Path) 
 
 def test_horizontal_fixes_tell_the_same_track() -> None:
     """Planar fixes beside the height prior: the horizontal track is that of fixes with their heights, batch and online."""
-    run = simulate_slowly(Scenario(path="loops", duration_s=20.0, noise="drift", imu_hz=50.0), 2, rate_hz=2.5)
+    run = simulate_slowly(Scenario(path="loops", duration_s=12.0, noise="drift", imu_hz=50.0), 2, rate_hz=2.5)
     flat = tuple(_flattened(m) if isinstance(m, GnssPosition) else m for m in run.recording.measurements)
     planar = replace(run.recording, measurements=flat)
     for solve in (smooth_recording, replay):

@@ -379,6 +379,8 @@ def test_an_imu_noisier_than_configured_is_scaled_up() -> None:
         replace(
             BASE,
             duration_s=10.0,
+            gnss_hz=4.0,
+            compass_hz=4.0,
             gnss_sigma_m=0.02,
             accel_noise_ug_per_sqrt_hz=30_000.0,
             gyro_noise_mdps_per_sqrt_hz=300.0,

@@ -92,24 +92,6 @@ def test_tags_that_come_late_are_the_place_of_a_batch() -> None:
     assert off_m[-1] < 1.0
 
 
-def test_a_step_uphill_is_no_noise_of_the_imu() -> None:
-    """The last tag is seen in a hole of 5 s of the IMU, and nothing tells a place after that: 13 s that a small turn moves by metres.
-
-    A single step of each pass left them where the IMU contradicts itself, a hundred times the cost, and its noise was scaled up 9 times.
-    """
-    less = {"imu_hz": "50", "gnss_hz": "2", "compass_hz": "4", "lidar_hz": "0", "camera_hz": "0"}
-    true = simulate(find_scenario("dock-fixed-optimal", {**less, "duration_s": "45", "route_s": "45"}), 2)
-    run, _ = tagfactory.sighted(true, rate_hz=4.0, hidden_s=(31.0, 45.0))
-    kept = tuple(m for m in run.recording.measurements if m.sensor != "gnss")
-    imu, config = run.recording.imu, with_few_states(run.config)
-    assert imu is not None
-    since_s = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
-    heard = imu.where((since_s < 27.0) | (since_s >= 32.0))
-    stats = app.smooth_recording(replace(run.recording, measurements=kept, imu=heard), config).solution.stats
-    assert not any("IMU noise scaled up" in line for line in stats.warnings)
-    assert stats.cost < 1.1 * stats.expected_cost
-
-
 def test_a_rebuild_does_not_make_it_surer(monkeypatch: pytest.MonkeyPatch) -> None:
     """What closes the chains of dock and tide is no news a second time."""
     run = docking()

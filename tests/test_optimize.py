@@ -1,12 +1,16 @@
 """The optimiser: full steps, where they fail, and the thread with the deep stack."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
 
 from graphloc import keys
 from graphloc.errors import SolveError
-from graphloc.solve import _on_deep_stack
+from graphloc.frames import Array
+from graphloc.solve import _on_deep_stack, _passes
 from graphloc.solve._optimize import bayes_tree, full_step, optimize
 from graphloc.solve._stretch import moved
 
@@ -31,6 +35,31 @@ def test_comes_down_from_a_start_two_radians_off() -> None:
     assert found.error < 1e-3 < graph.error(guess)
     assert found.error == pytest.approx(graph.error(found.values))
     assert abs(found.values.atPose2(15).theta()) < 0.01
+
+
+def test_a_pass_whose_one_step_leads_uphill_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was left there: of a run with a hole in its IMU a hundred times the cost, and taken for the IMU's noise.
+
+    By e(x) = atan(x) the step from 2 leads to -3.5, and steps of a method that looks at the cost to 0; that from 1 to -0.6, and is enough.
+    """
+
+    def off(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        x = float(values.atVector(0)[0])
+        if jacobians is not None:
+            jacobians[0] = np.array([[1.0 / (1.0 + x * x)]])
+        return np.array([np.arctan(x)])
+
+    graph, found = gtsam.NonlinearFactorGraph(), []
+    graph.add(gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, 0.01), [0], off))
+    for begin in (2.0, 1.0):
+        guess = gtsam.Values()
+        guess.insert(0, np.array([begin]))
+        built = (graph, guess)
+        monkeypatch.setattr(_passes, "build_graph", lambda *_, built=built, **__: built)
+        monkeypatch.setattr(_passes, "moved", lambda *_: 0.0)
+        problem: Any = SimpleNamespace(timeline=[0])
+        found.append(float(_passes.refine_run(problem, guess, {}, problem).values.atVector(0)[0]))
+    assert found == [pytest.approx(0.0, abs=0.01), pytest.approx(1.0 - np.pi / 2.0)]
 
 
 def test_never_returns_what_is_worse_than_the_guess() -> None:

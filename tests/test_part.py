@@ -283,7 +283,7 @@ def first_of(path: Path) -> int:
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return write_simulated(
-        simulate_slowly(Scenario(duration_s=20.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3),
+        simulate_slowly(Scenario(duration_s=12.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3),
         tmp_path_factory.mktemp("part") / "bag",
         ros=2,
     )
@@ -295,10 +295,10 @@ def test_smooth_and_replay_a_part(
     """Both give the track of a bag of that part, to the last digit, and their folders say which part it was."""
     bag, config = simulated
     begin_ns = first_of(bag)
-    only = copied(bag, tmp_path / "only", lambda _, at: begin_ns + 4 * S <= at < begin_ns + 14 * S)
+    only = copied(bag, tmp_path / "only", lambda _, at: begin_ns + 3 * S <= at < begin_ns + 10 * S)
     for command in ("smooth", "replay"):
         part, cut = tmp_path / f"{command}-part", tmp_path / f"{command}-only"
-        assert called(monkeypatch, command, bag, "-c", config, "-o", part, "--start", 4, "--duration", 10) == 0
+        assert called(monkeypatch, command, bag, "-c", config, "-o", part, "--start", 3, "--duration", 7) == 0
         (line,) = (said for said in capsys.readouterr().err.splitlines() if said.startswith(str(bag)))
         assert called(monkeypatch, command, only, "-c", config, "-o", cut) == 0
         assert "part of" not in capsys.readouterr().err
@@ -306,7 +306,7 @@ def test_smooth_and_replay_a_part(
             assert (part / name).read_bytes() == (cut / name).read_bytes(), name
         run, other = (json.loads((folder / "run.json").read_text()) for folder in (part, cut))
         assert other["part"] is None
-        assert (run["part"]["start_s"], run["part"]["end_s"]) == (4.0, 14.0)
+        assert (run["part"]["start_s"], run["part"]["end_s"]) == (3.0, 10.0)
         inside, left_out = run["part"]["messages"]["/imu/data"], run["part"]["left_out"]["/imu/data"]
         assert inside == sum(other["ledger"]["imu"].values())
         assert f"{sum(run['part']['messages'].values())} of " in line
@@ -314,8 +314,8 @@ def test_smooth_and_replay_a_part(
             assert inside + left_out == reader.topics["/imu/data"].msgcount
         assert run["warnings"] == other["warnings"]
         page = (part / "report.html").read_text()
-        assert "4.0 s to 14.0 s of 20." in page
-        assert "run, 4 s to 14 s</h1>" in page
+        assert "3.0 s to 10.0 s of 12." in page
+        assert "run, 3 s to 10 s</h1>" in page
 
 
 def test_finished_runs_have_no_parts(

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections import Counter, deque
 
 import numpy as np
-from scipy.stats import chi2
 
+from graphloc.chi2 import chi2_below
 from graphloc.config import BodyVelocityConfig, VesselConfig
 from graphloc.eval.ekf._inputs import Interval
 from graphloc.eval.ekf._planar import SILENT_Q, FilterResult, advance, run_filter, transition
@@ -58,7 +58,7 @@ class _HonestEkf:
         R = R + self._slow(m, len(R))
         nis = float(r @ np.linalg.solve(H @ P @ H.T + R, r))
         waited_s = (m.stamp_ns - self._agreed_ns.setdefault(m.sensor, m.stamp_ns)) / NS_PER_S
-        if nis > chi2.ppf(_GATE, len(r)) and waited_s < _PATIENCE_S:
+        if nis > chi2_below(_GATE, len(r)) and waited_s < _PATIENCE_S:
             return f"outside the {100 * _GATE:g} % gate"
         self._agreed_ns[m.sensor] = m.stamp_ns
         return R

@@ -8,8 +8,8 @@ from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from graphloc.chi2 import chi2_below
 from graphloc.eval.ekf import FilterResult, named_tracks
 from graphloc.eval.metrics import Levers, errors, held_out_errors, squared_over_covariance
 from graphloc.eval.plots._marks import (
@@ -140,7 +140,7 @@ def consistency(recording: Recording, solution: Solution, filters: Sequence[Filt
     if recording.truth is None:
         return None
     start = int(solution.trajectory.stamps_ns[0])
-    low, high = float(chi2.ppf(0.025, 2)), float(chi2.ppf(0.975, 2))
+    low, high = chi2_below(0.025, 2), chi2_below(0.975, 2)
     marks: list[Mark] = []
     ends, highest = [], 10.0
     for name, estimate, colour in reversed(_named(solution, filters)):
@@ -172,7 +172,7 @@ def coverage(recording: Recording, solution: Solution, filters: Sequence[FilterR
     for name, estimate, colour in reversed(_named(solution, filters)):
         found = _nees(estimate, recording.truth)
         if found is not None:
-            held = np.array([100.0 * float(np.mean(found[1] <= limit)) for limit in chi2.ppf(_SHARES, 2)])
+            held = np.array([100.0 * float(np.mean(found[1] <= chi2_below(share, 2))) for share in _SHARES])
             marks.append(Line(name=name, x=wanted, y=held, colour=colour))
     panel = Panel(title="coverage, horizontal", y="% of the time inside", marks=tuple(marks), range_y=(0.0, 101.0))
     return Figure(name="coverage", x="stated region, %", panels=(panel,), height=380)

@@ -68,9 +68,10 @@ def decode_cloud(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
     count = msg.width * msg.height
     points = _rows(msg, count).view(layout)
     with np.errstate(all="ignore"):  # signalling NaNs
-        xyz = np.column_stack([points[n].astype(float) for n in "xyz"])
-    keep = np.isfinite(xyz).all(axis=1) & (np.abs(xyz).max(axis=1) > 1e-3)  # drivers fill gaps with NaN or zeros
-    xyz = xyz[keep]
+        x, y, z = (points[n].astype(float) for n in "xyz")
+    # Drivers fill gaps with NaN or zeros. Column by column: numpy takes ten times as long along a short axis.
+    keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((abs(x) > 1e-3) | (abs(y) > 1e-3) | (abs(z) > 1e-3))
+    xyz = np.column_stack([v[keep] for v in (x, y, z)])
     timed = next((n for n in layout.names or () if n in _TIME_FIELDS), None)
     if timed is None or not len(xyz):
         return Cloud(lidar, stamp_ns, xyz, np.full(len(xyz), stamp_ns, dtype=np.int64))
@@ -244,7 +245,7 @@ def level(
         t, R = mounts[cloud.lidar]
         origin = (poses.p_world_m + poses.R_world_body @ t - up) @ to_level.T
         _move(cloud.points_m, to_level @ poses.R_world_body @ R, origin, row, points[begin : begin + len(row)])
-        origins.append(origin[row, :2])
+        origins.append(origin[:, :2].take(row, axis=0))
         begin += len(row)
     return LevelCloud(
         points,
@@ -258,8 +259,8 @@ def _move(points: Array, R: Array, t: Array, row: NDArray[np.int64], out: Array)
     """Write R[row] points + t[row]; one rotation matrix per point would take 72 bytes each."""
     for k in range(0, len(points), _CHUNK):
         part = slice(k, k + _CHUNK)
-        np.einsum("nij,nj->ni", R[row[part]], points[part], out=out[part])
-        out[part] += t[row[part]]
+        np.einsum("nij,nj->ni", R.take(row[part], axis=0), points[part], out=out[part])
+        out[part] += t.take(row[part], axis=0)
 
 
 def _during(cloud: Cloud, track: Trajectory) -> Cloud:

@@ -131,7 +131,8 @@ class AerialImage:
             "or another `datum:`"
         )
         uv = self._pixels_of_grid(west, north, n, cell_m)
-        if not np.isfinite(uv).all():  # beyond where the CRS is defined
+        lowest, highest = uv.min(axis=(1, 2)), uv.max(axis=(1, 2))
+        if not np.isfinite([lowest, highest]).all():  # beyond where the CRS is defined
             raise elsewhere
         eastward = np.hypot(*np.diff(uv[:, ::n], axis=2))  # of the first row
         if eastward.max() > 2.0 * np.median(eastward):
@@ -145,8 +146,8 @@ class AerialImage:
         if self._palette is not None:
             shrink = 1  # its numbers have no mean, and the nearest pixel is half a pixel off
         size = np.array([self._source.width, self._source.height])
-        low = np.clip(shrink * np.floor(uv.min(axis=(1, 2)) / shrink - 2.0), 0, size).astype(int)
-        high = np.clip(shrink * np.ceil(uv.max(axis=(1, 2)) / shrink + 3.0), 0, size).astype(int)
+        low = np.clip(shrink * np.floor(lowest / shrink - 2.0), 0, size).astype(int)
+        high = np.clip(shrink * np.ceil(highest / shrink + 3.0), 0, size).astype(int)
         if (high - low < 2).any():
             raise elsewhere
         if self._palette is not None and int(np.prod(high - low, dtype=np.int64)) > _PALETTE_PX:
@@ -158,7 +159,7 @@ class AerialImage:
         scale = np.array(has.shape[::-1]) / (high - low)
         if (finer * scale).max() > 1.5:  # the grid is coarser than what was read: average, do not pick
             image = cv2.GaussianBlur(image, (0, 0), sigmaX=0.4 * finer[0] * scale[0], sigmaY=0.4 * finer[1] * scale[1])
-        at = ((uv + 0.5 - low[:, None, None]) * scale[:, None, None] - 0.5).astype(np.float32)
+        at = (uv * scale[:, None, None] + ((0.5 - low) * scale - 0.5)[:, None, None]).astype(np.float32)
         pixels = cv2.remap(image, at[0], at[1], cv2.INTER_LINEAR)
         covered = cv2.remap(has, at[0], at[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
         if not covered.any():
@@ -181,7 +182,10 @@ class AerialImage:
         # Linear between knots, by a product: cv2.remap would round to a 32nd of their distance, 0.25 m.
         at = np.arange(n) * (len(knots) - 1) / (n - 1)
         between = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(len(knots))))
-        return np.stack([between @ net[:, k].reshape(len(knots), -1) @ between.T for k in (0, 1)])
+        uv = np.empty((2, n, n))
+        for k in (0, 1):
+            np.matmul(between @ net[:, k].reshape(len(knots), -1), between.T, out=uv[k])
+        return uv
 
     def _read(self, low: NDArray[np.int_], size: NDArray[np.int_], shrink: int) -> tuple[Any, Any]:
         """Return colours (rows, columns, 3) uint8 of a window, reduced by a factor, and the mask of data, uint8."""

@@ -75,12 +75,13 @@ class Outline:
 def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float = 100.0) -> Outline:
     """Return the outline of a cloud; points within `hull` (K, 2) in body, a closed polygon, are the vessel itself."""
     p, away = cloud.points_m, np.hypot(*cloud.points_m[:, :2].T)
-    keep = (away < reach_m) & np.isfinite(p).all(axis=1)
+    keep = (away < reach_m) & np.isfinite(p[:, 2])  # of no number is less than the reach
     if hull is not None:
         keep &= ~inside(hull, p[:, :2])
     now = np.arange(len(p)) < (len(p) if cloud.now is None else cloud.now)
     keep &= (keep & now).any()  # without a point of its own a scan tells nothing new
-    now, p, origin = now[keep], p[keep], cloud.origin_m[keep]
+    chosen = np.flatnonzero(keep)
+    now, p, origin = now[chosen], p.take(chosen, axis=0), cloud.origin_m.take(chosen, axis=0)
     own = None if now.all() else outline(LevelCloud(p[now], origin[now]), None, reach_m)
     dry = p[:, 2] > _DRY_M
     cells, low, high, count = _columns(p[dry])
@@ -107,24 +108,30 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
 
 def inside(polygon: NDArray[np.float64], points_m: Array) -> NDArray[np.bool_]:
     """Return which points (N, 2) are within a polygon (K, 2)."""
+    (west, south), (east, north) = polygon.min(axis=0), polygon.max(axis=0)
+    u, v = points_m[:, 0], points_m[:, 1]
+    within = (u >= west) & (u <= east) & (v >= south) & (v <= north)  # most are not
     a, b = polygon, np.roll(polygon, -1, axis=0)
-    x, y = points_m[:, :1], points_m[:, 1:]
+    x, y = u[within, None], v[within, None]
     spans = (a[:, 1] > y) != (b[:, 1] > y)
     with np.errstate(divide="ignore", invalid="ignore"):
         crossing = (b[:, 0] - a[:, 0]) * (y - a[:, 1]) / (b[:, 1] - a[:, 1]) + a[:, 0]
-    return np.asarray((spans & (x < crossing)).sum(axis=1) % 2 == 1)
+    within[within] = (spans & (x < crossing)).sum(axis=1) % 2 == 1
+    return np.asarray(within)
 
 
 def _columns(p: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
     """Stack points into columns: mean position (M, 2), lowest and highest (M,), count (M,)."""
-    key = np.floor(p[:, :2] / _CELL_M).astype(np.int64)
-    _, group, count = np.unique(key[:, 0] * 1_000_003 + key[:, 1], return_inverse=True, return_counts=True)
-    order = np.argsort(group, kind="stable")
-    begin = np.concatenate([[0], np.cumsum(count)[:-1]])
     if not len(p):
         return np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64)
-    total = np.add.reduceat(p[order, :2], begin, axis=0)
-    z = p[order, 2]
+    column, row = np.floor(p[:, :2].T / _CELL_M).astype(np.int64)
+    key = column * 1_000_003 + row
+    order = np.argsort(key, kind="stable")
+    ordered = key[order]
+    begin = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    count = np.diff(begin, append=len(p))
+    total = np.column_stack([np.add.reduceat(p[:, k].take(order), begin) for k in (0, 1)])
+    z = p[:, 2].take(order)
     return total / count[:, None], np.minimum.reduceat(z, begin), np.maximum.reduceat(z, begin), count
 
 
@@ -151,13 +158,15 @@ def _lines(at: Array, near_m: float) -> tuple[Array, Array]:
 
 def _first_returns(p: Array, origin: Array) -> tuple[Array, Array]:
     """Return the nearest object in each direction that rises out of the water, and the direction (rad)."""
-    near = p[:, 2] < _SHORE_M
-    d = p[near, :2]
+    near = np.flatnonzero(p[:, 2] < _SHORE_M)
+    d = p.take(near, axis=0)[:, :2]
     away, angle = np.hypot(*d.T), np.arctan2(d[:, 1], d[:, 0])
     sector = np.floor((angle + np.pi) / (2.0 * np.pi) * _SECTORS).astype(int) % _SECTORS
-    order = np.lexsort((away, sector))
-    first = order[np.unique(sector[order], return_index=True)[1]] if len(order) else order
-    ray = d[first] - origin[near][first]
+    nearest = np.full(_SECTORS, np.inf)
+    np.minimum.at(nearest, sector, away)
+    found = np.flatnonzero(away == nearest[sector])
+    first = found[np.unique(sector[found], return_index=True)[1]]
+    ray = d[first] - origin[near[first]]
     return d[first], np.arctan2(ray[:, 1], ray[:, 0])
 
 

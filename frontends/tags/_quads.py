@@ -30,20 +30,18 @@ def quads_in(grey: NDArray[np.uint8], min_side_px: float, cells: int) -> Array:
     low, high = cv2.erode(toned, box), cv2.dilate(toned, box)
     noise = float(np.median(cv2.subtract(high[::8, ::8], low[::8, ::8])))
     contrast = int(np.clip(noise, _LEAST_CONTRAST, _MOST_NOISE))
-    return np.asarray(_quads(grey, toned, low, high, contrast, 0.7 * min_side_px, cells))
+    # Not compiled as one: each compiled function contains, and optimises again, those that it calls.
+    found = _hulls(*_runs(toned, low, high, contrast), 0.7 * min_side_px)
+    return np.asarray(found[_aligned(grey, found, cells)])
 
 
 @compiled
-def _quads(grey, toned, low, high, contrast, least_px, cells):  # type: ignore[no-untyped-def]
-    """Return dark quadrilaterals (n, 4, 2), each aligned with its edges."""
-    ends, row, parent = _runs(toned, low, high, contrast)
-    found = _hulls(ends, row, parent, least_px)
-    n = 0
+def _aligned(grey, found, cells):  # type: ignore[no-untyped-def]
+    """Align quadrilaterals (n, 4, 2) with their edges; return whether each has them (n,)."""
+    has = np.zeros(len(found), dtype=np.bool_)
     for k in range(len(found)):
-        if _has_sides(grey, found[k]) and _straighten(grey, found[k], cells):
-            found[n] = found[k]
-            n += 1
-    return found[:n]
+        has[k] = _has_sides(grey, found[k]) and _straighten(grey, found[k], cells)
+    return has
 
 
 @compiled
@@ -129,9 +127,9 @@ def _hull(begin, end, top):  # type: ignore[no-untyped-def]
     """Return the convex hull (n, 2), clockwise in the image, of rows of pixels from begin to end."""
     height = len(begin)
     hull = np.empty((2 * height, 2))
-    n = 0
+    n = low = np.int64(0)  # a literal 0 is a type of its own, for which `_append` would be compiled, too
     for v in range(height):  # down the right side
-        n = _append(hull, 0, n, end[v], top + v)
+        n = _append(hull, low, n, end[v], top + v)
     low = n
     for v in range(height - 1, -1, -1):  # up the left one
         n = _append(hull, low, n, begin[v], top + v)
@@ -164,13 +162,13 @@ def _farthest(hull, i, j):  # type: ignore[no-untyped-def]
 @compiled
 def _largest(hull, quad, dark, least):  # type: ignore[no-untyped-def]
     """Write a hull's largest quadrilateral, found by moving one corner at a time; return whether it may be a tag's."""
-    i, j = 0, 0  # the first vertex is a corner of the hull, and what is farthest from it is another
+    c = np.zeros(4, dtype=np.int64)  # the first vertex is a corner of the hull, and what is farthest from it is another
+    far = 0.0
     for k in range(len(hull)):
-        if np.hypot(hull[k, 0] - hull[i, 0], hull[k, 1] - hull[i, 1]) > np.hypot(
-            hull[j, 0] - hull[i, 0], hull[j, 1] - hull[i, 1]
-        ):
-            j = k
-    c = np.array([i, _farthest(hull, i, j), j, _farthest(hull, j, i)])
+        away = np.hypot(hull[k, 0] - hull[0, 0], hull[k, 1] - hull[0, 1])
+        if away > far:
+            far, c[2] = away, k
+    c[1], c[3] = _farthest(hull, c[0], c[2]), _farthest(hull, c[2], c[0])
     for _ in range(6):
         moved = False
         for m in range(4):
@@ -180,7 +178,7 @@ def _largest(hull, quad, dark, least):  # type: ignore[no-untyped-def]
         if not moved:
             break
     for m in range(4):
-        quad[m] = hull[c[m]]
+        quad[m, 0], quad[m, 1] = hull[c[m], 0], hull[c[m], 1]
     inside = _area(quad)
     return _shortest(quad) >= 0.7 * least and inside >= max(least**2, _FULL * _area(hull)) and dark < 1.3 * inside
 
@@ -206,14 +204,17 @@ def _shortest(quad):  # type: ignore[no-untyped-def]
 @compiled
 def _has_sides(grey, quad):  # type: ignore[no-untyped-def]
     """Return whether it is brighter outside of every side, by similar amounts."""
-    contrast = np.zeros(4)
+    least, most = 1e9, -1e9
     for k in range(4):
-        p, d = quad[k], quad[(k + 1) % 4] - quad[k]
-        out_u, out_v = d[1] / np.hypot(d[0], d[1]), -d[0] / np.hypot(d[0], d[1])
+        du, dv = quad[(k + 1) % 4, 0] - quad[k, 0], quad[(k + 1) % 4, 1] - quad[k, 1]
+        long = np.hypot(du, dv)
+        out_u, out_v = dv / long, -du / long
+        contrast = 0.0
         for i in range(6):
-            u, v = p[0] + (i + 1) / 7.0 * d[0], p[1] + (i + 1) / 7.0 * d[1]
-            contrast[k] += bilinear(grey, u + 1.5 * out_u, v + 1.5 * out_v) - bilinear(grey, u - out_u, v - out_v)
-    return contrast.min() > max(6.0 * _LEAST_SLOPE, _MOST_UNEQUAL * contrast.max())
+            u, v = quad[k, 0] + (i + 1) / 7.0 * du, quad[k, 1] + (i + 1) / 7.0 * dv
+            contrast += bilinear(grey, u + 1.5 * out_u, v + 1.5 * out_v) - bilinear(grey, u - out_u, v - out_v)
+        least, most = min(least, contrast), max(most, contrast)
+    return least > max(6.0 * _LEAST_SLOPE, _MOST_UNEQUAL * most)
 
 
 @compiled

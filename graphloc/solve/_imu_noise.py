@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import diags_array
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtrc
 
 from graphloc.build import Problem, StartPrior, with_imu_noise
 from graphloc.frames import Array
@@ -59,8 +59,8 @@ def imu_misfit(
     rows = np.arange(9 * links).reshape(-1, 9)
     own, needed = (rows[:, :3].ravel(), rows[:, 3:].ravel()), np.ones(2)
     squares, freedom = first = _squares_and_freedom(solved, own)
-    low = np.array([f > _LEAST_FREEDOM and chi2.cdf(s, f) < _UNLIKELY for s, f in zip(squares, freedom, strict=True)])
-    high = np.array([chi2.sf(s, max(f, 0.1)) < _UNLIKELY_IF_SCATTERED for s, f in zip(squares, freedom, strict=True)])
+    low = np.array([f > _LEAST_FREEDOM and chdtr(f, s) < _UNLIKELY for s, f in zip(squares, freedom, strict=True)])
+    high = np.array([chdtrc(max(f, 0.1), s) < _UNLIKELY_IF_SCATTERED for s, f in zip(squares, freedom, strict=True)])
     high &= np.array(most) > 1.0
     follow = low | high
     for _ in range(_NOISE_ROUNDS if follow.any() else 0):
