@@ -44,7 +44,7 @@ def axes_swapped(m: Measurement) -> Measurement:
 
 
 def biased(m: Measurement) -> Measurement:
-    return replace(m, gyro_radps=m.gyro_radps + [0.0, 0.0, 0.3]) if isinstance(m, ImuSample) else m
+    return replace(m, gyro_radps=m.gyro_radps + np.array([0.0, 0.0, 0.3])) if isinstance(m, ImuSample) else m
 
 
 def blamed(fed: Fed) -> int:
@@ -99,7 +99,12 @@ def test_a_trial_that_explains_nothing_leaves_no_trace(monkeypatch: pytest.Monke
         return np.array([e.p_world_m for e in fed.estimates])
 
     tried = []
-    monkeypatch.setattr(Lag, "explained", lambda *_: bool(tried.append(1)))
+
+    def nothing(*_: object) -> bool:
+        tried.append(1)
+        return False
+
+    monkeypatch.setattr(Lag, "explained", nothing)
     after_trials = estimates()
     assert tried
     monkeypatch.setattr(Tracking, "doubt_imu", lambda *_: None)
@@ -156,8 +161,8 @@ def test_rates_that_turn_otherwise() -> None:
     rates = np.tile([0.0, 0.0, 0.2], (len(stamps), 1))
     turned = gtsam.Rot3.Expmap(np.array([0.0, 0.0, 0.2])).matrix()
     assert not turns_otherwise(stamps, rates, turned)
-    assert not turns_otherwise(stamps, rates + [0.0, 0.0, 0.5], turned)  # a vessel in a gap may
-    assert turns_otherwise(stamps, rates + [0.0, 0.0, 0.7], turned)
+    assert not turns_otherwise(stamps, rates + np.array([0.0, 0.0, 0.5]), turned)  # a vessel in a gap may
+    assert turns_otherwise(stamps, rates + np.array([0.0, 0.0, 0.7]), turned)
     assert turns_otherwise(stamps, rates[:, [2, 1, 0]] * 5.0, turned)
 
 

@@ -413,9 +413,12 @@ class Tracking:
         if since_ns is None or not anchors or anchors[0].stamp_ns >= since_ns:
             return None
         ledger.enter(failed.gone())
-        mark, doubt, pending = ledger.marked(), deepcopy(self._doubt), self._pending
-        receivers, check = persistent.receivers, persistent.heading_check
-        persistent.receivers, persistent.heading_check = deepcopy(receivers), HeadingCheck()
+        mark, doubt, pending, heights = ledger.marked(), deepcopy(self._doubt), self._pending, self._height_due_ns
+        # What learns from each measurement, and would from the trial as well.
+        receivers, check, model = persistent.receivers, persistent.heading_check, persistent.motion_model
+        scatters = {name: deepcopy(stream.scatter) for name, stream in failed.problem.streams.items()}
+        persistent.receivers, persistent.motion_model = deepcopy(receivers), deepcopy(model)
+        persistent.heading_check = HeadingCheck()  # its accelerations are wrong
         for receiver in persistent.receivers.values():
             receiver.jump.forget_since(since_ns)
         self._doubt.leave_out(since_ns, until_ns)
@@ -430,7 +433,10 @@ class Tracking:
         if not explained:
             ledger.back_to(mark)
             self.lag, self._pending, self._doubt = failed, pending, doubt
-            persistent.receivers, persistent.heading_check = receivers, check
+            persistent.receivers, persistent.heading_check, persistent.motion_model = receivers, check, model
+            self._height_due_ns = heights
+            for name, stream in failed.problem.streams.items():
+                stream.scatter = scatters[name]
             for m in out:
                 recent.keep(m)
             return None
