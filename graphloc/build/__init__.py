@@ -44,6 +44,7 @@ from graphloc.build._problem import (
     with_noise_scale,
     with_sensor_noise,
     with_usual_motion,
+    without_imu,
 )
 from graphloc.build._thinned import Thinned, thinned
 
@@ -89,4 +90,5 @@ __all__ = [
     "with_sensor_noise",
     "with_usual_motion",
     "without_drift",
+    "without_imu",
 ]

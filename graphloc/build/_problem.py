@@ -84,6 +84,7 @@ class Problem:
             share them.
         rejected: ledger rows of measurements that the graph cannot take.
         silent: clauses on why sensors have no measurement here.
+        left_out: spans (after one stamp until another, ns) whose samples of the IMU are left out.
         usual_motion: where the motion model is used; None before there is an estimate, and where nothing needs it.
     """
 
@@ -102,6 +103,7 @@ class Problem:
     rejected: tuple[LedgerRow, ...]
     warnings: tuple[str, ...] = field(default=())
     silent: str = ""
+    left_out: tuple[tuple[int, int], ...] = ()
     usual_motion: UsualMotion | None = None
 
 
@@ -142,9 +144,25 @@ def noisier_imu(sensor: Any, gyro: float, accel: float) -> Any:
 
 
 def _relinked(problem: Problem, config: VesselConfig, noise_scale: float) -> Problem:
-    links = problem.relink(config.sensors[problem.imu.sensor], noise_scale)
+    links = _links(problem, config, noise_scale, problem.left_out)
     relinked = replace(problem, config=config, links=links, noise_scale=noise_scale)
     return with_links(relinked, preintegrate(problem.timeline, links))
+
+
+def _links(
+    problem: Problem, config: VesselConfig, noise_scale: float, left_out: Sequence[tuple[int, int]]
+) -> InertialLink:
+    links = problem.relink(config.sensors[problem.imu.sensor], noise_scale)
+    for span in left_out:
+        links.leave_out(*span)
+    return links
+
+
+def without_imu(problem: Problem, values: gtsam.Values, after_ns: int, until_ns: int) -> Problem:
+    """Return the problem without the samples of the IMU after one stamp until another, bridged as a gap by `values`."""
+    left_out = (*problem.left_out, (after_ns, until_ns))
+    links = _links(problem, problem.config, problem.noise_scale, left_out)
+    return _bridged(replace(problem, links=links, left_out=left_out), values, [(after_ns, until_ns)])
 
 
 def with_links(problem: Problem, preintegrated: tuple[Any, ...]) -> Problem:
@@ -155,9 +173,13 @@ def with_links(problem: Problem, preintegrated: tuple[Any, ...]) -> Problem:
 
 def bridged(problem: Problem, values: gtsam.Values) -> Problem:
     """Return the problem with new links across IMU gaps: the vessel continues there as it moved before, by `values`."""
+    return _bridged(problem, values, problem.links.gaps())
+
+
+def _bridged(problem: Problem, values: gtsam.Values, gaps: Sequence[tuple[int, int]]) -> Problem:
     timeline, zero = problem.timeline, gtsam.imuBias.ConstantBias()
     preintegrated, inertial = list(problem.preintegrated), list(problem.inertial)
-    for start_ns, stop_ns in problem.links.gaps():
+    for start_ns, stop_ns in gaps:
         first = timeline.floor(start_ns)
         bias = values.atConstantBias(keys.bias(int(timeline.slow_of[first])))
         going = Going.of(nav_state(values, first), bias)

@@ -22,10 +22,12 @@ from graphloc.solve._memory import give_back_memory
 from graphloc.solve._offsets import offsets_of
 from graphloc.solve._parts import solve_parts
 from graphloc.solve._solution import make_solution
+from graphloc.solve._wrong_imu import ImuWrong, left_out
 
 __all__ = ["smooth"]
 
 _T = TypeVar("_T")
+_MOST_TIMES = 2  # that spans in which the IMU is wrong are looked for, each without those before
 _STACK_BYTES = 1 << 29  # address space, not memory: pages are taken when touched
 
 
@@ -53,9 +55,17 @@ def smooth(
 
     def solve(part: Recording, heading_deg: float | None) -> Solution:
         begun = config if heading_deg is None else config.with_start_heading(heading_deg)
-        problem = make_problem(part, begun, datum, rows, inertial)
-        result = solve_batch(problem, progress)
+        said = list[str]()
+        for tried in range(_MOST_TIMES + 1):
+            problem = make_problem(part, begun, datum, rows, inertial)
+            try:
+                result = solve_batch(problem, progress, doubt_imu=tried < _MOST_TIMES)
+                break
+            except ImuWrong as wrong:
+                part, why = left_out(part, wrong.spans)
+                said.append(why)
         solution = make_solution(problem, part, result)
+        solution = replace(solution, stats=replace(solution.stats, warnings=(*said, *solution.stats.warnings)))
         if probe is None:
             return solution
         result = result.lightened()  # the offsets take a graph of their own

@@ -106,16 +106,20 @@ def noise_step(ratio: float) -> float:
     return float(np.clip(np.sqrt(ratio), 1.5, 3.0))
 
 
-def solve_batch(problem: Problem, progress: Progress = quiet, *, newest: bool = False) -> BatchResult:
+def solve_batch(
+    problem: Problem, progress: Progress = quiet, *, newest: bool = False, doubt_imu: bool = False
+) -> BatchResult:
     """Solve a whole run.
 
     Args:
         newest: `heading_var` is asked for at the last state alone.
+        doubt_imu: whether to look for spans in which the IMU is wrong.
 
     Raises:
+        ImuWrong: there are some.
         SolveError: it could not be started, or the linear algebra failed.
     """
-    begun, solved = _first_solution(problem, progress, newest=newest)
+    begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu)
     as_stated, misfit = solved.choice(), solved.misfit()
     passes, iterations = solved.settled.passes, begun.iterations + solved.settled.iterations
     for _ in range(_MAX_NOISE_ROUNDS):
@@ -195,7 +199,7 @@ class _Solved(NamedTuple):
         return _Choice(self.problem, self.settled.values, self.settled.verdicts)
 
 
-def _first_solution(problem: Problem, progress: Progress, *, newest: bool) -> tuple[Begun, _Solved]:
+def _first_solution(problem: Problem, progress: Progress, *, newest: bool, doubt_imu: bool) -> tuple[Begun, _Solved]:
     """Solve a run with the IMU's noise as it is.
 
     Where that contradicts the other sensors, the run is begun without each sensor of heading or velocity, too; else without those of
@@ -203,7 +207,7 @@ def _first_solution(problem: Problem, progress: Progress, *, newest: bool) -> tu
     for most of a run may lead the heading away, where nothing leads back. Not for `newest`, as a start online has no time for it.
     """
     few = thinned(problem)
-    begun = whole = _begin(problem, few, progress, newest=newest)
+    begun = whole = _begin(problem, few, progress, newest=newest, doubt_imu=doubt_imu)
     solved = _from_there(problem, few, begun, progress)
     misfit, last = solved.misfit(), len(problem.timeline) - 1
     doubted = [] if newest else [
@@ -256,11 +260,11 @@ def _off_for_long(off: NDArray[np.bool_]) -> bool:
     return bool(share > _OFTEN and np.count_nonzero(off[1:] != off[:-1]) < share * (1.0 - share) * len(off))
 
 
-def _begin(problem: Problem, few: Thinned, progress: Progress, *, newest: bool) -> Begun:
+def _begin(problem: Problem, few: Thinned, progress: Progress, *, newest: bool, doubt_imu: bool = False) -> Begun:
     """Start a run, grow it over the thinned one, and fill in the other states."""
     begun = solve_start(few.problem, align(problem), progress, newest=newest)
     grown, prior, known, iterations, *_ = begun
-    iterations += grow(few.problem, grown, prior, known, progress)
+    iterations += grow(few.problem, grown, prior, known, progress, doubt_imu=doubt_imu)
     grown, used, _ = rough_passes(few.problem, grown, prior, progress, (Stage.FINAL,), _SEAM_PASSES)
     stamps, few_stamps = problem.timeline.stamps_ns, few.problem.timeline.stamps_ns[: known + 1]
     return begun._replace(

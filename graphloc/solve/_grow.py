@@ -8,7 +8,7 @@ from collections.abc import Callable, Container
 import gtsam
 import numpy as np
 
-from graphloc.build import Past, Problem, StartPrior
+from graphloc.build import Past, Problem, StartPrior, without_imu
 from graphloc.recording import Progress
 from graphloc.solve._decide import PredictedCovariance, Stage, Verdicts, decisions, predicted_covariance, weigh
 from graphloc.solve._optimize import bayes_tree
@@ -22,6 +22,7 @@ from graphloc.solve._stretch import (
     solve_until_written_there,
     update_states,
 )
+from graphloc.solve._wrong_imu import ImuWrong, wrong_span
 
 _CHUNK_S, _OVERLAP_S = 15.0, 5.0
 _SETTLED_M = 0.5
@@ -38,13 +39,19 @@ def grow(
     chunk_s: float = _CHUNK_S,
     overlap_s: float = _OVERLAP_S,
     watch: Callable[[int, Verdicts], None] = lambda _last, _verdicts: None,
+    doubt_imu: bool = False,
 ) -> int:
-    """Take the estimate of states 0..known to the end of the run, a chunk at a time, in place.
+    """Take the estimate of states 0..known to the end of the run, a chunk at a time, in place; return the iterations.
 
     Args:
         chunk_s, overlap_s: how far a step goes, and how far back its window reaches.
         watch: called with the last state of each window and the decisions in it, as known at that time.
+        doubt_imu: whether to look for spans in which the IMU is wrong.
+
+    Raises:
+        ImuWrong: there are some.
     """
+    spans = list[tuple[int, int]]()
     stamps, slow_of, end = problem.timeline.stamps_ns, problem.timeline.slow_of, len(problem.timeline) - 1
     prior: StartPrior | Past = start
     verdicts = weigh(problem, estimate, first=0, last=known, stage=Stage.FINAL)
@@ -59,9 +66,27 @@ def grow(
             first = start_of_window
         dead_reckon(problem, estimate, known, until)
         used, step, verdicts = _solve_grown(problem, estimate, first, known, until, prior)
+        if doubt_imu:
+
+            def again(
+                rest: Problem,
+                first: int = first,
+                known: int = known,
+                until: int = until,
+                prior: StartPrior | Past = prior,
+            ) -> None:
+                _solve_grown(rest, estimate, first, known, until, prior)
+
+            if (span := wrong_span(problem, estimate, first, known, until, prior, again)) is not None:
+                spans.append((int(stamps[span[0]]), int(stamps[span[1]])))
+                problem = without_imu(problem, estimate, *spans[-1])
+                more, step, verdicts = _solve_grown(problem, estimate, first, known, until, prior)
+                used += more
         watch(until, verdicts)
         iterations, known = iterations + used, until
         progress("growing", known, end)
+    if spans:
+        raise ImuWrong(spans)
     return iterations
 
 
@@ -74,7 +99,7 @@ def _solve_grown(
     window solved with Huber losses alone is off by many of its own sigmas (0.01 rad/s of gyro bias, 300 m after 20 s of dead
     reckoning).
     """
-    fresh = {(s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)}
+    fresh = _fresh(problem, known, last)
     step, verdicts, iterations = _solve_without(problem, values, first, known, last, prior, fresh)
     if not fresh:
         return iterations, step, verdicts
@@ -88,6 +113,11 @@ def _solve_grown(
         if step.moved_m < _SETTLED_M:
             break
     return iterations, step, verdicts
+
+
+def _fresh(problem: Problem, known: int, last: int) -> set[tuple[int, int]]:
+    """Return the measurements with hypotheses that are new in a window."""
+    return {(s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)}
 
 
 def _solve_without(

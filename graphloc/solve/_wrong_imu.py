@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Is the IMU wrong for a while? Offline: as a run is grown, a window in which it contradicts the other sensors is solved without it.
+
+A wrong unit, a loose plug, a saturated axis: no noise of the IMU explains it, and with more of it the whole run is spoiled. Nor does
+one sensor that is wrong: so two of them at least must agree in the solution without the IMU that do not with it, and the motion there
+must be one that a vessel may make. The span is as short as it can be without contradicting them again. Online: `graphloc.online._imu_doubt`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc import keys
+from graphloc.build import Past, Problem, StartPrior, nav_state, without_imu
+from graphloc.chi2 import chi2_95
+from graphloc.errors import SolveError
+from graphloc.ledger import Outcome
+from graphloc.recording import Recording
+from graphloc.solve._decide import AGREES, met
+from graphloc.solve._passes import cost_as_configured
+from graphloc.solve._stretch import copy_states
+from graphloc.time import NS_PER_S, utc_text
+
+WHY = "contradicts the other sensors, which agree with each other"
+_SUSPECT, _TIMES = (
+    36.0,
+    30.0,
+)  # squares of an IMU factor that make it one; and how many times those of the window before
+_BEFORE_S = 2.5  # what is known before a window may be wrong already
+_PRICE, _CLEARLY = 1.0, 10.0  # log-likelihood: of each IMU factor that is left out, and of leaving out any
+_WORSE = 6.0  # log-likelihood by which a shorter span may be less probable
+_IN_A_ROW = 3  # measurements of a sensor that disagree make it one that denies
+_SENSORS, _FEWEST = 2, 2  # that agree without the IMU, and with how many measurements more
+_MOTION = 3.0  # sigmas of the motion in a gap (`factors.imu`), once and per second
+
+
+class ImuWrong(Exception):
+    """The IMU is wrong in some spans (after one stamp until another, ns)."""
+
+    def __init__(self, spans: Sequence[tuple[int, int]]) -> None:
+        super().__init__(spans)
+        self.spans = tuple(spans)
+
+
+def left_out(recording: Recording, spans: Sequence[tuple[int, int]]) -> tuple[Recording, str]:
+    """Return a recording without the samples of its IMU in some spans, and a warning."""
+    assert recording.imu is not None
+    imu = recording.imu
+    wrong = np.zeros(len(imu), dtype=bool)
+    for after_ns, until_ns in spans:
+        wrong |= (imu.stamps_ns > after_ns) & (imu.stamps_ns <= until_ns)
+    where = ", ".join(f"{(b - a) / NS_PER_S:.1f} s from {utc_text(a)}" for a, b in spans)
+    rows = (*recording.rows, *recording.imu_rows(wrong, Outcome.REJECTED, WHY))
+    said = f"{imu.sensor}: for {where} it {WHY}: {int(wrong.sum())} samples rejected, the motion there is bridged as in an IMU gap"
+    return replace(recording, imu=imu.where(~wrong), rows=rows), said
+
+
+class _Found(NamedTuple):
+    """A window solved without the IMU between two of its states: the problem, the cost, and the values of its states."""
+
+    problem: Problem
+    cost: float
+    values: gtsam.Values
+
+
+def wrong_span(
+    problem: Problem,
+    values: gtsam.Values,
+    first: int,
+    known: int,
+    last: int,
+    prior: StartPrior | Past,
+    solve: Callable[[Problem], None],
+) -> tuple[int, int] | None:
+    """Return the states between which the IMU is wrong in a window that has been solved, first..last; None: it is not.
+
+    Args:
+        values: in place; at the end as without it there. known: the last state of the window before.
+        solve: solves the window of a problem, in place.
+    """
+    begin = max(first + 1, problem.timeline.floor(int(problem.timeline.stamps_ns[known] - _BEFORE_S * NS_PER_S)))
+    agreed = _agreeing(problem, values, begin, last)
+    if not _contradicted(problem, values, first, begin, last) and sum(map(_denies, agreed)) < _SENSORS:
+        return None
+    as_is = copy_states(problem, values, first, last)
+    cost = cost_as_configured(problem, values, first, last, prior, judged=last)
+
+    def without(a: int, b: int) -> _Found:
+        values.update(as_is)
+        stamps_ns = problem.timeline.stamps_ns
+        rest = without_imu(problem, values, int(stamps_ns[a]), int(stamps_ns[b]))
+        for k in range(a, last):
+            bias = values.atConstantBias(keys.bias(int(problem.timeline.slow_of[k])))
+            state = rest.preintegrated[k].predict(nav_state(values, k), bias)
+            values.update(keys.pose(k + 1), state.pose())
+            values.update(keys.velocity(k + 1), np.asarray(state.velocity()))
+        solve(rest)
+        found = cost_as_configured(rest, values, first, last, prior, judged=last) + _PRICE * (b - a)
+        return _Found(rest, found, copy_states(rest, values, first, last))
+
+    def explains(a: int, b: int, found: _Found) -> bool:
+        """Whether it is clearly more probable, by several sensors and a motion that a vessel may make."""
+        if found.cost > cost - _CLEARLY:
+            return False
+        stamps_ns = problem.timeline.stamps_ns
+        moved = sum(2.0 * found.problem.inertial[k].error(found.values) for k in range(a, b))
+        may = _MOTION**2 * (1.0 + (stamps_ns[b] - stamps_ns[a]) / NS_PER_S)
+        pairs = zip(_agreeing(found.problem, found.values, begin, last), agreed, strict=True)
+        return bool(moved <= may and sum(now.sum() - before.sum() >= _FEWEST for now, before in pairs) >= _SENSORS)
+
+    span = None
+    try:
+        if explains(begin, last, whole := without(begin, last)):
+            (a, b), found = _shortest(without, begin, last, whole)
+            if explains(a, b, found):
+                span, as_is = (a, b), found.values
+    except SolveError:
+        pass  # the window stands as it is
+    values.update(as_is)
+    return span
+
+
+def _contradicted(problem: Problem, values: gtsam.Values, first: int, begin: int, last: int) -> bool:
+    """Whether a factor of the IMU costs far more than usual."""
+    squares = np.array([2.0 * problem.inertial[k].error(values) for k in range(first, last)])
+    usual = float(np.median(squares[: max(begin - first, 1)]))
+    return bool(squares[begin - first :].max(initial=0.0) > max(_SUSPECT, _TIMES * usual))
+
+
+def _denies(agreed: NDArray[np.bool_]) -> bool:
+    """Whether several in a row disagree."""
+    in_a_row = np.convolve(~agreed, np.ones(_IN_A_ROW), "valid") if len(agreed) >= _IN_A_ROW else np.zeros(1)
+    return bool(in_a_row.max() > _IN_A_ROW - 0.5)
+
+
+def _shortest(
+    without: Callable[[int, int], _Found], begin: int, last: int, whole: _Found
+) -> tuple[tuple[int, int], _Found]:
+    """Return the shortest span that is about as probable as the whole, and its solution: both ends by bisection."""
+    a, wrong = begin, last
+    while wrong - a > 1:
+        middle = (a + wrong) // 2
+        found = without(middle, last)
+        if found.cost <= whole.cost + _WORSE:
+            a = middle
+        else:
+            wrong = middle
+    b, wrong = last, a
+    while b - wrong > 1:
+        middle = (b + wrong) // 2
+        found = without(a, middle)
+        if found.cost <= whole.cost + _WORSE:
+            b = middle
+        else:
+            wrong = middle
+    a, b = max(a - 1, begin), min(b + 1, last)  # the ends as found may be wrong for a part of a state's time
+    return (a, b), without(a, b)
+
+
+def _agreeing(problem: Problem, values: gtsam.Values, first: int, last: int) -> list[NDArray[np.bool_]]:
+    """Return which measurements of each stream agree with an estimate, by its kernel as configured; of several modes the nearest."""
+    found = []
+    for stream in problem.streams:
+        kernel, agrees = stream.config.kernel, list[bool]()
+        for modes in met(problem, stream, stream.between(first, last), values)[1]:
+            nis, dof = min(r.nis() for r in modes), len(modes[0].raw)
+            by_kernel = stream.row.false is None
+            agrees.append(kernel.weight(nis / dof) >= AGREES if by_kernel else nis < chi2_95(dof))
+        found.append(np.array(agrees, dtype=bool))
+    return found
