@@ -162,7 +162,20 @@ def without_imu(problem: Problem, values: gtsam.Values, after_ns: int, until_ns:
     """Return the problem without the samples of the IMU after one stamp until another, bridged as a gap by `values`."""
     left_out = (*problem.left_out, (after_ns, until_ns))
     links = _links(problem, problem.config, problem.noise_scale, left_out)
-    return _bridged(replace(problem, links=links, left_out=left_out), values, [(after_ns, until_ns)])
+    streams = tuple(_carried_anew(s, problem.timeline, links, after_ns, until_ns) for s in problem.streams)
+    return _bridged(replace(problem, links=links, left_out=left_out, streams=streams), values, [(after_ns, until_ns)])
+
+
+def _carried_anew(stream: Stream, timeline: Timeline, links: InertialLink, after_ns: int, until_ns: int) -> Stream:
+    """Return a stream whose measurements in a span are carried from their states by these links."""
+    zero, carry, gyro = gtsam.imuBias.ConstantBias(), list(stream.carry), np.array(stream.gyro_radps)
+    for i, (m, carried) in enumerate(zip(stream.measurements, carry, strict=True)):
+        if after_ns < m.stamp_ns <= until_ns:
+            gyro[i] = links.gyro_at(np.array([m.stamp_ns]))[0]
+            if carried is not None:
+                at_ns = int(timeline.stamps_ns[carried[0]])
+                carry[i] = carried[0], links.integrate(at_ns, m.stamp_ns, zero)
+    return replace(stream, carry=tuple(carry), gyro_radps=gyro)
 
 
 def with_links(problem: Problem, preintegrated: tuple[Any, ...]) -> Problem:

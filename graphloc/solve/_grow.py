@@ -51,12 +51,14 @@ def grow(
     Raises:
         ImuWrong: there are some.
     """
-    spans = list[tuple[int, int]]()
     stamps, slow_of, end = problem.timeline.stamps_ns, problem.timeline.slow_of, len(problem.timeline) - 1
     prior: StartPrior | Past = start
     verdicts = weigh(problem, estimate, first=0, last=known, stage=Stage.FINAL)
     step = solve_stretch(problem, estimate, 0, known, prior, decisions(verdicts))
     iterations, first = step.iterations, 0
+    if doubt_imu and (found := _without_imu(problem, estimate, 0, 0, known, prior, gtsam.Values())) is not None:
+        problem, step, verdicts, more = found
+        iterations += more
     while known < end:
         until = int(min(np.searchsorted(stamps, stamps[known] + int(chunk_s * 1e9)), end))
         back = problem.timeline.floor(int(stamps[known]) - int(overlap_s * 1e9))
@@ -64,30 +66,40 @@ def grow(
         if start_of_window > first and slow_of[start_of_window] < slow_of[known]:
             prior = past_at(problem, step, start_of_window)
             first = start_of_window
+        before = copy_states(problem, estimate, first, known)
         dead_reckon(problem, estimate, known, until)
         used, step, verdicts = _solve_grown(problem, estimate, first, known, until, prior)
-        if doubt_imu:
-
-            def again(
-                rest: Problem,
-                first: int = first,
-                known: int = known,
-                until: int = until,
-                prior: StartPrior | Past = prior,
-            ) -> None:
-                _solve_grown(rest, estimate, first, known, until, prior)
-
-            if (span := wrong_span(problem, estimate, first, known, until, prior, again)) is not None:
-                spans.append((int(stamps[span[0]]), int(stamps[span[1]])))
-                problem = without_imu(problem, estimate, *spans[-1])
-                more, step, verdicts = _solve_grown(problem, estimate, first, known, until, prior)
-                used += more
+        if doubt_imu and (found := _without_imu(problem, estimate, first, known, until, prior, before)) is not None:
+            problem, step, verdicts, more = found
+            used += more
         watch(until, verdicts)
         iterations, known = iterations + used, until
         progress("growing", known, end)
-    if spans:
-        raise ImuWrong(spans)
+    if doubt_imu and problem.left_out:
+        raise ImuWrong(problem.left_out)
     return iterations
+
+
+def _without_imu(
+    problem: Problem,
+    values: gtsam.Values,
+    first: int,
+    known: int,
+    last: int,
+    prior: StartPrior | Past,
+    before: gtsam.Values,
+) -> tuple[Problem, StretchStep, Verdicts, int] | None:
+    """Return the problem without the IMU where it is wrong in a window, and this solved, in place; None: it is not wrong."""
+
+    def solve(rest: Problem) -> None:
+        _solve_grown(rest, values, first, known, last, prior)
+
+    span = wrong_span(problem, values, first, known, last, prior, before, solve)
+    if span is None:
+        return None
+    problem = without_imu(problem, values, *span)
+    iterations, step, verdicts = _solve_grown(problem, values, first, known, last, prior)
+    return problem, step, verdicts, iterations
 
 
 def _solve_grown(

@@ -24,7 +24,7 @@ from graphloc.ledger import Outcome
 from graphloc.recording import Recording
 from graphloc.solve._decide import AGREES, met
 from graphloc.solve._passes import cost_as_configured
-from graphloc.solve._stretch import copy_states
+from graphloc.solve._stretch import copy_states, slow_at
 from graphloc.time import NS_PER_S, utc_text
 
 WHY = "contradicts the other sensors, which agree with each other"
@@ -76,13 +76,14 @@ def wrong_span(
     known: int,
     last: int,
     prior: StartPrior | Past,
+    before: gtsam.Values,
     solve: Callable[[Problem], None],
 ) -> tuple[int, int] | None:
-    """Return the states between which the IMU is wrong in a window that has been solved, first..last; None: it is not.
+    """Return where the IMU is wrong in a window that has been solved, states first..last: after one stamp until another (ns); None: it is not.
 
     Args:
         values: in place; at the end as without it there. known: the last state of the window before.
-        solve: solves the window of a problem, in place.
+        before: its states up to there, as solved without what is new. solve: solves the window of a problem, in place.
     """
     begin = max(first + 1, problem.timeline.floor(int(problem.timeline.stamps_ns[known] - _BEFORE_S * NS_PER_S)))
     agreed = _agreeing(problem, values, begin, last)
@@ -92,14 +93,13 @@ def wrong_span(
     cost = cost_as_configured(problem, values, first, last, prior, judged=last)
 
     def without(a: int, b: int) -> _Found:
+        # Not from the window as solved, whose biases may be bent as far back as it reaches.
         values.update(as_is)
+        values.update(before)
         stamps_ns = problem.timeline.stamps_ns
+        _dead_reckon_anew(problem, values, known, max(a, known))
         rest = without_imu(problem, values, int(stamps_ns[a]), int(stamps_ns[b]))
-        for k in range(a, last):
-            bias = values.atConstantBias(keys.bias(int(problem.timeline.slow_of[k])))
-            state = rest.preintegrated[k].predict(nav_state(values, k), bias)
-            values.update(keys.pose(k + 1), state.pose())
-            values.update(keys.velocity(k + 1), np.asarray(state.velocity()))
+        _dead_reckon_anew(rest, values, a, last)
         solve(rest)
         found = cost_as_configured(rest, values, first, last, prior, judged=last) + _PRICE * (b - a)
         return _Found(rest, found, copy_states(rest, values, first, last))
@@ -119,11 +119,27 @@ def wrong_span(
         if explains(begin, last, whole := without(begin, last)):
             (a, b), found = _shortest(without, begin, last, whole)
             if explains(a, b, found):
-                span, as_is = (a, b), found.values
+                span = int(problem.timeline.stamps_ns[a]), int(problem.timeline.stamps_ns[b])
+                as_is = found.values
     except SolveError:
         pass  # the window stands as it is
     values.update(as_is)
     return span
+
+
+def _dead_reckon_anew(problem: Problem, values: gtsam.Values, known: int, until: int) -> None:
+    """Replace the states after `known` until another by dead reckoning, and their slow states by those of `known`."""
+    slow_of = problem.timeline.slow_of
+    j = int(slow_of[known])
+    bias, slow = values.atConstantBias(keys.bias(j)), slow_at(problem, values, j)
+    for k in range(known, until):
+        state = problem.preintegrated[k].predict(nav_state(values, k), bias)
+        values.update(keys.pose(k + 1), state.pose())
+        values.update(keys.velocity(k + 1), np.asarray(state.velocity()))
+    for node in range(j + 1, int(slow_of[until]) + 1):
+        values.update(keys.bias(node), bias)
+        for number, value in slow.items():
+            values.update(keys.slow(number, node), value)
 
 
 def _contradicted(problem: Problem, values: gtsam.Values, first: int, begin: int, last: int) -> bool:
