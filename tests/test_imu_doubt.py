@@ -8,7 +8,9 @@ import gtsam
 import numpy as np
 import pytest
 
+from graphloc import app
 from graphloc.config import ImuConfig
+from graphloc.eval.metrics import TrackErrors, errors
 from graphloc.factors.imu import ROW
 from graphloc.frames import Array
 from graphloc.graph import Going
@@ -17,9 +19,10 @@ from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, ImuSe
 from graphloc.online._imu_doubt import Denials, ImuDoubt, turns_otherwise
 from graphloc.online._lag import Lag
 from graphloc.online._tracking import Tracking
-from graphloc.solution import Health
+from graphloc.recording import Recording
+from graphloc.solution import Health, Solution
 from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
-from tests.test_online_faults import run_of, smoother
+from tests.test_online_faults import at_s, run_of, smoother
 
 S = 1_000_000_000
 Change = Callable[[Measurement], Measurement]
@@ -91,10 +94,51 @@ def test_sensors_that_no_motion_explains_are_not_believed_against_the_imu(change
     assert not [r for r in fed.rows if r.sensor == "imu" and r.outcome is Outcome.REJECTED]
 
 
+def smoothed(change: Change) -> tuple[Solution, Recording, TrackErrors]:
+    """The same offline."""
+    run = run_of()
+    samples = [a.m for a in changed(change) if isinstance(a.m, ImuSample)]
+    assert run.recording.imu is not None
+    imu = replace(
+        run.recording.imu,
+        accel_mps2=np.array([m.accel_mps2 for m in samples]),
+        gyro_radps=np.array([m.gyro_radps for m in samples]),
+    )
+    begin = int(imu.stamps_ns[0])
+    others = [change(m) if 12 * S <= m.stamp_ns - begin < 16 * S else m for m in run.recording.measurements]
+    recording = replace(run.recording, imu=imu, measurements=tuple(others))
+    solution = app.smooth_recording(recording, run.config).solution
+    return solution, recording, errors(solution.trajectory, run.truth)
+
+
+@pytest.mark.parametrize("change", [axes_swapped, biased])
+def test_offline_it_is_left_out_where_it_is_wrong(change: Change) -> None:
+    solution, recording, off = smoothed(change)
+    assert np.linalg.norm(off.position_m[:, :2], axis=1).max() < 1.0
+    assert np.abs(off.heading_rad).max() < np.radians(8.0)
+    (said,) = (w for w in solution.stats.warnings if "contradicts the other sensors, which agree" in w)
+    assert recording.imu is not None
+    stamps_ns = np.array([r.stamp_ns for r in solution.ledger if r.sensor == "imu" and r.outcome is Outcome.REJECTED])
+    left_out_s = (stamps_ns - recording.imu.stamps_ns[0]) / S
+    assert f"{len(left_out_s)} samples rejected" in said
+    assert 10.0 < left_out_s.min() < 12.5
+    assert left_out_s.max() < 18.0
+    assert np.ptp(left_out_s) > 2.0  # axes that are swapped contradict nothing while little moves
+
+
+@pytest.mark.parametrize("change", [compass_off, both_off])
+def test_offline_it_is_not_blamed_for_others(change: Change) -> None:
+    solution, *_ = smoothed(change)
+    assert not any("contradicts the other sensors, which agree" in w for w in solution.stats.warnings)
+
+
 def test_a_trial_that_explains_nothing_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+    arrivals = changed(in_degrees)
+    arrivals = arrivals[: at_s(arrivals, 15.0)]
+
     def estimates() -> Array:
         online = smoother(run_of())
-        fed = finish(online, feed(online, run_of(), changed(in_degrees)))
+        fed = finish(online, feed(online, run_of(), arrivals))
         assert blamed(fed) == 0
         return np.array([e.p_world_m for e in fed.estimates])
 
@@ -123,6 +167,18 @@ def test_denials_count_in_a_row_and_at_once() -> None:
     assert not denials.at_once(3 * S)  # a while ago
     denials.note("compass", 2 * S, agrees=True, outlier=False)
     assert not denials.at_once(2 * S)
+
+
+def test_sensors_that_were_wrong_before_do_not_count() -> None:
+    """A compass of the wrong sense denies a right gyroscope as often as not."""
+    for wrong in (2, 4):
+        denials = Denials()
+        for n in range(10):
+            denials.note("compass", n * S, agrees=n % 10 >= wrong, outlier=False)
+        for n in range(5):
+            for sensor in ("compass", "gnss"):
+                denials.note(sensor, 10 * S + n * S // 5, agrees=False, outlier=False)
+        assert bool(denials.at_once(11 * S)) == (wrong == 2)
 
 
 def test_what_a_matcher_denied_long_ago_does_not_count_for_or_against() -> None:

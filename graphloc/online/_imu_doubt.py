@@ -11,6 +11,7 @@ few seconds, one that is right again is missed for about as long as it was wrong
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 
 import gtsam
@@ -22,6 +23,7 @@ from graphloc.time import duration_ns
 
 WHY = "contradicts the other sensors, which agree with each other"
 _SENSORS, _FEWEST, _MANY = 2, 2, 5  # that deny; measurements in a row of each, and of one of them at least
+_KEPT, _RIGHT = 50, 0.7  # measurements before these; share that must have agreed (with Cauchy at 1.5 sigmas, 0.87 do)
 _AT_ONCE_S = 2.5  # since the first denial: after that, a gap explains a jump of the fixes as well
 _BEFORE_S = 0.3  # the wrong samples begin before anything denies them
 _AGAIN_S = 1.0  # after a trial that explained nothing
@@ -31,29 +33,39 @@ _TURNED_RADPS = 0.6  # per sqrt(s): 3 sigmas of the turn in a gap (`factors.imu`
 
 
 class Denials:
-    """Which sensors have denied the estimate on arrival, in a row."""
+    """Which sensors have denied the estimate on arrival, in a row, after they had agreed with it."""
 
     def __init__(self) -> None:
         self._in_a_row: dict[str, list[int]] = {}
+        self._agreed: dict[str, deque[bool]] = {}  # before these
 
     def note(self, sensor: str, stamp_ns: int, *, agrees: bool, outlier: bool) -> None:
         """Note how a measurement was judged; `outlier`: its sensor denies any estimate now and then, so only its last ones count."""
         stamps = self._in_a_row.setdefault(sensor, [])
-        if agrees:
-            stamps.clear()
-        elif outlier or len(stamps) < _MANY:
-            stamps.append(stamp_ns)
+        before = self._agreed.setdefault(sensor, deque(maxlen=_KEPT))
         if outlier:
-            del stamps[:-_FEWEST]
+            stamps.append(stamp_ns)
+            del stamps[: len(stamps) if agrees else -_FEWEST]
+        elif agrees:
+            before.extend([False] * len(stamps) + [True])
+            stamps.clear()
+        elif len(stamps) < _MANY:
+            stamps.append(stamp_ns)
 
     def at_once(self, now_ns: int) -> Mapping[str, int]:
-        """Return the stamp (ns) of the first denial of each sensor that began to deny a moment ago; nothing where it may be chance."""
+        """Return the stamp (ns) of the first denial of each sensor that began to deny a moment ago; nothing where it may be chance.
+
+        A compass of the wrong sense denies a right gyroscope as often as not, and the fixes deny what comes of it; so does no sensor
+        that was wrong before.
+        """
         begun = {
             name: stamps
             for name, stamps in self._in_a_row.items()
             if len(stamps) >= _FEWEST and now_ns - min(stamps) < _AT_ONCE_S * 1e9
         }
         if len(begun) < _SENSORS or max(map(len, begun.values())) < _MANY:
+            return {}
+        if any(sum(agreed) < _RIGHT * len(agreed) for agreed in map(self._agreed.__getitem__, begun)):
             return {}
         return {name: min(stamps) for name, stamps in begun.items()}
 
