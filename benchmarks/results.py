@@ -35,6 +35,7 @@ import smoothing
 import sweep
 import tag_detector
 import where
+import wrong_imu
 from _rows import ROOT, Row
 
 FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
@@ -67,6 +68,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "E.4": online.shuffled,
     "E.5": online_faults.faults,
     "E.6": online.odometry,
+    "E.imu": wrong_imu.figures,
     "F.3": batch.figures,
     "F.3p": where.figures,
     "F.4": fuzz.figures,
