@@ -16,6 +16,7 @@ from graphloc.frames import Array
 from graphloc.graph import Going
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, ImuSeries, Measurement
+from graphloc.online import _lag
 from graphloc.online._imu_doubt import Denials, ImuDoubt, turns_otherwise
 from graphloc.online._lag import Lag
 from graphloc.online._tracking import Tracking
@@ -92,6 +93,18 @@ def test_sensors_that_no_motion_explains_are_not_believed_against_the_imu(change
     fed = finish(online, feed(online, run_of(), changed(change)))
     assert blamed(fed) == 0
     assert not [r for r in fed.rows if r.sensor == "imu" and r.outcome is Outcome.REJECTED]
+
+
+@pytest.mark.parametrize("guard", ["_MOTION", "_EXPLAINED"])
+def test_it_is_left_out_only_where_a_motion_of_a_vessel_explains_the_denials(
+    guard: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No motion is quiet enough, or no share of what denied large enough: then the estimate of the IMU stands."""
+    arrivals = changed(axes_swapped)
+    arrivals = arrivals[: at_s(arrivals, 15.5)]
+    monkeypatch.setattr(_lag, guard, {"_MOTION": 0.0, "_EXPLAINED": 1.1}[guard])
+    online = smoother(run_of())
+    assert blamed(feed(online, run_of(), arrivals)) == 0
 
 
 def smoothed(change: Change) -> tuple[Solution, Recording, TrackErrors]:
