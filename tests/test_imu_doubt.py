@@ -3,6 +3,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 
 import gtsam
 import numpy as np
@@ -179,17 +180,36 @@ def test_a_trial_that_explains_nothing_leaves_no_trace(monkeypatch: pytest.Monke
     assert np.array_equal(after_trials, estimates())
 
 
+SIZES = count()
+
+
+def grown() -> float:
+    """The size of a residual: each is larger than the one before."""
+    return 2.0 ** next(SIZES)
+
+
+def test_what_is_off_by_the_same_has_jumped() -> None:
+    """Heading and place of one receiver do so together."""
+    for grows in (False, True):
+        denials = Denials()
+        for n in range(5):
+            size = 50.0 + 20.0 * n * grows
+            denials.note("compass", n * S // 5, size, agrees=False, outlier=False)
+            denials.note("gnss", n * S // 5, size, agrees=False, outlier=False)
+        assert bool(denials.at_once(S)) == grows
+
+
 def test_denials_count_in_a_row_and_at_once() -> None:
     denials = Denials()
     for n in range(5):
-        denials.note("gnss", n * S // 4, agrees=False, outlier=False)
+        denials.note("gnss", n * S // 4, grown(), agrees=False, outlier=False)
     assert not denials.at_once(S)  # a single sensor is itself in doubt
-    denials.note("compass", S // 2, agrees=False, outlier=False)
+    denials.note("compass", S // 2, grown(), agrees=False, outlier=False)
     assert not denials.at_once(S)
-    denials.note("compass", S, agrees=False, outlier=False)
+    denials.note("compass", S, grown(), agrees=False, outlier=False)
     assert denials.at_once(S) == {"gnss": 0, "compass": S // 2}
     assert not denials.at_once(3 * S)  # a while ago
-    denials.note("compass", 2 * S, agrees=True, outlier=False)
+    denials.note("compass", 2 * S, grown(), agrees=True, outlier=False)
     assert not denials.at_once(2 * S)
 
 
@@ -198,19 +218,19 @@ def test_sensors_that_were_wrong_before_do_not_count() -> None:
     for wrong in (2, 4):
         denials = Denials()
         for n in range(10):
-            denials.note("compass", n * S, agrees=n % 10 >= wrong, outlier=False)
+            denials.note("compass", n * S, grown(), agrees=n % 10 >= wrong, outlier=False)
         for n in range(5):
             for sensor in ("compass", "gnss"):
-                denials.note(sensor, 10 * S + n * S // 5, agrees=False, outlier=False)
+                denials.note(sensor, 10 * S + n * S // 5, grown(), agrees=False, outlier=False)
         assert bool(denials.at_once(11 * S)) == (wrong == 2)
 
 
 def test_what_a_matcher_denied_long_ago_does_not_count_for_or_against() -> None:
     denials = Denials()
     for n in (0, 20, 21):
-        denials.note("matcher", n * S, agrees=False, outlier=True)
+        denials.note("matcher", n * S, grown(), agrees=False, outlier=True)
     for n in range(5):
-        denials.note("gnss", 20 * S + n * S // 5, agrees=False, outlier=False)
+        denials.note("gnss", 20 * S + n * S // 5, grown(), agrees=False, outlier=False)
     assert denials.at_once(21 * S) == {"gnss": 20 * S, "matcher": 20 * S}
 
 

@@ -4,7 +4,7 @@
 One sensor that disagrees is itself in doubt, and its kernel takes its weight. Two that begin to within seconds of each other have
 one thing in common: the motion between them and what was known before. So the samples since then are tried as a gap
 (`Tracking.doubt_imu`), and they are left out where that explains what denied them by a motion that a vessel may have made. What
-follows is left out for half a second, and again for as long as its rates turn otherwise than the estimate does without them. Where
+follows is left out for half a second, and on for as long as its rates turn otherwise than the estimate does without them. Where
 wrong ones do not (an accelerometer) and are denied again, it is twice as long each time: an IMU that stays wrong costs a rebuild every
 few seconds, one that is right again is missed for about as long as it was wrong.
 """
@@ -24,10 +24,12 @@ from graphloc.time import duration_ns
 WHY = "contradicts the other sensors, which agree with each other"
 _SENSORS, _FEWEST, _MANY = 2, 2, 5  # that deny; measurements in a row of each, and of one of them at least
 _KEPT, _RIGHT = 50, 0.7  # measurements before these; share that must have agreed (with Cauchy at 1.5 sigmas, 0.87 do)
+_GROWS = 2.0  # times the square of the first residual in a row
 _AT_ONCE_S = 2.5  # since the first denial: after that, a gap explains a jump of the fixes as well
 _BEFORE_S = 0.3  # the wrong samples begin before anything denies them
 _AGAIN_S = 1.0  # after a trial that explained nothing
 _HOLD_S = (0.5, 4.0)  # for how long samples are left out: at first, and at most
+_TOLD_S = 10.0  # before a gap, as the means of `factors.imu`
 _QUIET_S = 10.0  # without a denial after that, it is over
 _TURNED_RADPS = 0.6  # per sqrt(s): 3 sigmas of the turn in a gap (`factors.imu`)
 
@@ -37,10 +39,15 @@ class Denials:
 
     def __init__(self) -> None:
         self._in_a_row: dict[str, list[int]] = {}
+        self._sizes: dict[str, tuple[float, float]] = {}  # of the first of these, and of the last
         self._agreed: dict[str, deque[bool]] = {}  # before these
 
-    def note(self, sensor: str, stamp_ns: int, *, agrees: bool, outlier: bool) -> None:
-        """Note how a measurement was judged; `outlier`: its sensor denies any estimate now and then, so only its last ones count."""
+    def note(self, sensor: str, stamp_ns: int, size: float, *, agrees: bool, outlier: bool) -> None:
+        """Note how a measurement was judged.
+
+        Args:
+            size: its squared residual, in sigmas. outlier: its sensor denies any estimate now and then, so only its last ones count.
+        """
         stamps = self._in_a_row.setdefault(sensor, [])
         before = self._agreed.setdefault(sensor, deque(maxlen=_KEPT))
         if outlier:
@@ -49,14 +56,17 @@ class Denials:
         elif agrees:
             before.extend([False] * len(stamps) + [True])
             stamps.clear()
-        elif len(stamps) < _MANY:
-            stamps.append(stamp_ns)
+        else:
+            self._sizes[sensor] = (self._sizes[sensor][0] if stamps else size, size)
+            if len(stamps) < _MANY:
+                stamps.append(stamp_ns)
 
     def at_once(self, now_ns: int) -> Mapping[str, int]:
         """Return the stamp (ns) of the first denial of each sensor that began to deny a moment ago; nothing where it may be chance.
 
         A compass of the wrong sense denies a right gyroscope as often as not, and the fixes deny what comes of it; so does no sensor
-        that was wrong before.
+        that was wrong before. And what is off by the same throughout has jumped, as the heading and the place of one receiver do
+        together: that of an IMU which is wrong grows.
         """
         begun = {
             name: stamps
@@ -66,6 +76,8 @@ class Denials:
         if len(begun) < _SENSORS or max(map(len, begun.values())) < _MANY:
             return {}
         if any(sum(agreed) < _RIGHT * len(agreed) for agreed in map(self._agreed.__getitem__, begun)):
+            return {}
+        if not any(last > _GROWS * first for first, last in (self._sizes[n] for n in begun if n in self._sizes)):
             return {}
         return {name: min(stamps) for name, stamps in begun.items()}
 
@@ -127,6 +139,10 @@ class ImuDoubt:
     def over(self, stamp_ns: int) -> bool:
         """Return whether a sample comes after the last gap."""
         return stamp_ns > self._over_ns()
+
+    def told_by(self, first_ns: int) -> list[tuple[int, int]]:
+        """Return the spans before the gaps that reach beyond a stamp: their samples tell how the vessel goes on there."""
+        return [(a - duration_ns(_TOLD_S), a) for a, b in self.gaps if b >= first_ns]
 
     def _over_ns(self) -> int:
         return self.gaps[-1][1] if self.gaps else 0

@@ -91,13 +91,14 @@ class Judge:
         if why := self.receivers.reject(stream, m, at, residuals[0]):
             self._entries.add(Entry(stream, i, Verdict.false(residuals[0], at, why)))
             if stream.receiver.jump.suspects(m.stamp_ns):
-                self.denials.note(stream.name, m.stamp_ns, agrees=False, outlier=False)
+                self.denials.note(stream.name, m.stamp_ns, residuals[0].nis(), agrees=False, outlier=False)
         elif stream.row.false is None:
             verdict, widened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
             # Behind a widened kernel it is used, but whether it agrees shows only when it is judged again.
             if not widened or verdict.weight < AGREES:
                 self._agreement.note(stream, m, verdict)
-                self.denials.note(stream.name, m.stamp_ns, agrees=verdict.weight >= AGREES, outlier=False)
+                agrees = verdict.weight >= AGREES
+                self.denials.note(stream.name, m.stamp_ns, residuals[0].nis(), agrees=agrees, outlier=False)
             entry = Entry(stream, i, verdict, widened=widened)
             self._entries.add(entry)
             self._schedule(self._problem.timeline.seconds(m.stamp_ns) + _REJUDGE_AGES_S[0], entry)
@@ -189,7 +190,7 @@ class Judge:
                 self._agreement.note(stream, entry.measurement, verdict)
             if not entry.judged:
                 agrees, stamp_ns = verdict.weight >= AGREES, entry.measurement.stamp_ns
-                self.denials.note(stream.name, stamp_ns, agrees=agrees, outlier=True)
+                self.denials.note(stream.name, stamp_ns, 0.0, agrees=agrees, outlier=True)
             if not entry.judged and verdict.weight < AGREES:
                 self._refuted.add(stream.name)
             if not entry.judged and (verdict.weight < _CERTAIN or stream.name in self._others):

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from graphloc.measurements import ImuSample, Measurement
 from graphloc.online._anchor import Anchor
@@ -37,8 +37,12 @@ class Recent:
         """Keep a measurement, whatever its stamp."""
         self._came.append(m)
 
-    def keep_anchor(self, lag: Lag) -> bool:
-        """Keep the newest state as an anchor if one is due, and forget what is older than the oldest anchor; return whether it was due."""
+    def keep_anchor(self, lag: Lag, keep_ns: Sequence[tuple[int, int]] = ()) -> bool:
+        """Keep the newest state as an anchor if one is due, and forget what is older than the oldest anchor; return whether it was due.
+
+        Args:
+            keep_ns: spans (stamps) of which IMU samples are kept, however old.
+        """
         at_ns, anchors = lag.newest.stamp_ns, self.anchors
         if anchors and at_ns - anchors[-1].stamp_ns < _EVERY_S * 1e9:
             return False
@@ -47,7 +51,9 @@ class Recent:
             anchors.popleft()
         kept = []
         for m in self._came:
-            if m.stamp_ns >= anchors[0].stamp_ns:
+            if m.stamp_ns >= anchors[0].stamp_ns or (
+                isinstance(m, ImuSample) and any(a <= m.stamp_ns <= b for a, b in keep_ns)
+            ):
                 kept.append(m)
             elif isinstance(m, ImuSample) and (self._before is None or m.stamp_ns > self._before.stamp_ns):
                 self._before = m

@@ -94,6 +94,7 @@ class Tracking:
         persistent = self._persistent
         setup = self._setup.scaled(persistent.sensor_noise.times)
         since_ns = anchor.stamp_ns - 2 * duration_ns(setup.gap_s)
+        since_ns = min([since_ns, *(a for a, _ in self._doubt.told_by(anchor.stamp_ns))])
         known = [m for m in samples if m.stamp_ns >= since_ns] or samples[-1:]
         assert persistent.datum is not None
         problem = live_problem(
@@ -256,7 +257,7 @@ class Tracking:
 
     def keep_anchor(self) -> bool:
         """Remember the newest state as an anchor, if that is due, and forget what no rebuild needs; tell whether it was due."""
-        if not self._recent.keep_anchor(self.lag):
+        if not self._recent.keep_anchor(self.lag, self._doubt.told_by(self.lag.first_ns)):
             return False
         self._ledger.forget_but({m.seq for m in self._recent})
         return True
@@ -453,14 +454,12 @@ class Tracking:
 
     def _goes_on_wrong(self) -> bool | None:
         """Return whether the samples that were left out last contradict the states that were made without them; None: too few to tell."""
-        lag = self.lag
+        lag, out = self.lag, sorted(self._held_out, key=lambda m: m.stamp_ns)  # late ones are among them
         stamps_ns, _, R, _ = lag.track()
-        first, end = np.searchsorted(stamps_ns, [self._held_out[0].stamp_ns, self._held_out[-1].stamp_ns + 1])
-        held = (
-            [m for m in self._held_out if stamps_ns[first] <= m.stamp_ns <= stamps_ns[end - 1]]
-            if end > first + 1
-            else []
-        )
+        first, end = np.searchsorted(stamps_ns, [out[0].stamp_ns, out[-1].stamp_ns + 1])
+        if end <= first + 1:
+            return None
+        held = [m for m in out if stamps_ns[first] <= m.stamp_ns <= stamps_ns[end - 1]]
         if len(held) < 2:
             return None
         bias = lag.newest.bias.gyroscope()

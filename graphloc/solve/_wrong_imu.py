@@ -20,6 +20,7 @@ from graphloc import keys
 from graphloc.build import Past, Problem, StartPrior, nav_state, without_imu
 from graphloc.chi2 import chi2_95
 from graphloc.errors import SolveError
+from graphloc.frames import Array
 from graphloc.ledger import Outcome
 from graphloc.recording import Recording
 from graphloc.solve._decide import AGREES, met
@@ -35,6 +36,7 @@ _SUSPECT, _TIMES = (
 _BEFORE_S = 2.5  # what is known before a window may be wrong already
 _PRICE, _CLEARLY = 1.0, 10.0  # log-likelihood: of each IMU factor that is left out, and of leaving out any
 _WORSE = 6.0  # log-likelihood by which a shorter span may be less probable
+_GROWS = 2.0  # times the square of the first residual in a row
 _IN_A_ROW = 3  # measurements of a sensor that disagree make it one that denies
 _SENSORS, _FEWEST = 2, 2  # that agree without the IMU, and with how many measurements more
 _MOTION = 3.0  # sigmas of the motion in a gap (`factors.imu`), once and per second
@@ -86,8 +88,11 @@ def wrong_span(
         before: its states up to there, as solved without what is new. solve: solves the window of a problem, in place.
     """
     begin = max(first + 1, problem.timeline.floor(int(problem.timeline.stamps_ns[known] - _BEFORE_S * NS_PER_S)))
-    agreed = _agreeing(problem, values, begin, last)
+    agreed, squares = _agreeing(problem, values, begin, last)
     if not _contradicted(problem, values, first, begin, last) and sum(map(_denies, agreed)) < _SENSORS:
+        return None
+    denying = [n for n, agrees in enumerate(agreed) if _denies(agrees)]
+    if denying and not any(_grows(agreed[n], squares[n]) for n in denying):
         return None
     as_is = copy_states(problem, values, first, last)
     cost = cost_as_configured(problem, values, first, last, prior, judged=last)
@@ -111,7 +116,7 @@ def wrong_span(
         stamps_ns = problem.timeline.stamps_ns
         moved = sum(2.0 * found.problem.inertial[k].error(found.values) for k in range(a, b))
         may = _MOTION**2 * (1.0 + (stamps_ns[b] - stamps_ns[a]) / NS_PER_S)
-        pairs = zip(_agreeing(found.problem, found.values, begin, last), agreed, strict=True)
+        pairs = zip(_agreeing(found.problem, found.values, begin, last)[0], agreed, strict=True)
         return bool(moved <= may and sum(now.sum() - before.sum() >= _FEWEST for now, before in pairs) >= _SENSORS)
 
     span = None
@@ -155,6 +160,14 @@ def _denies(agreed: NDArray[np.bool_]) -> bool:
     return bool(in_a_row.max() > _IN_A_ROW - 0.5)
 
 
+def _grows(agreed: NDArray[np.bool_], squares: Array) -> bool:
+    """Whether a residual grows while several in a row disagree: what is off by the same throughout has jumped, as all that one receiver tells."""
+    begin = int(np.argmax(np.convolve(~agreed, np.ones(_IN_A_ROW), "valid")))
+    ends = np.flatnonzero(agreed[begin:])
+    row = squares[begin : begin + int(ends[0]) if len(ends) else len(squares)]
+    return bool(row.max() > _GROWS * row[0])
+
+
 def _shortest(
     without: Callable[[int, int], _Found], begin: int, last: int, whole: _Found
 ) -> tuple[tuple[int, int], _Found]:
@@ -179,14 +192,23 @@ def _shortest(
     return (a, b), without(a, b)
 
 
-def _agreeing(problem: Problem, values: gtsam.Values, first: int, last: int) -> list[NDArray[np.bool_]]:
-    """Return which measurements of each stream agree with an estimate, by its kernel as configured; of several modes the nearest."""
-    found = []
+def _agreeing(
+    problem: Problem, values: gtsam.Values, first: int, last: int
+) -> tuple[list[NDArray[np.bool_]], list[Array]]:
+    """Return which measurements of each stream agree with an estimate, by its kernel as configured, and their squared residuals, in sigmas.
+
+    Of several modes the nearest.
+    """
+    found, squares = list[NDArray[np.bool_]](), list[Array]()
     for stream in problem.streams:
-        kernel, agrees = stream.config.kernel, list[bool]()
-        for modes in met(problem, stream, stream.between(first, last), values)[1]:
-            nis, dof = min(r.nis() for r in modes), len(modes[0].raw)
-            by_kernel = stream.row.false is None
-            agrees.append(kernel.weight(nis / dof) >= AGREES if by_kernel else nis < chi2_95(dof))
+        modes = met(problem, stream, stream.between(first, last), values)[1]
+        nis = np.array([min(r.nis() for r in several) for several in modes])
+        dofs = [len(several[0].raw) for several in modes]
+        kernel, by_kernel = stream.config.kernel, stream.row.false is None
+        agrees = [
+            kernel.weight(each / dof) >= AGREES if by_kernel else each < chi2_95(dof)
+            for each, dof in zip(nis, dofs, strict=True)
+        ]
         found.append(np.array(agrees, dtype=bool))
-    return found
+        squares.append(nis)
+    return found, squares
