@@ -193,7 +193,7 @@ def test_what_is_off_by_the_same_has_jumped() -> None:
     for grows in (False, True):
         denials = Denials()
         for n in range(5):
-            size = 50.0 + 20.0 * n * grows
+            size = 50.0 + 45.0 * n * grows
             denials.note("compass", n * S // 5, size, agrees=False, outlier=False)
             denials.note("gnss", n * S // 5, size, agrees=False, outlier=False)
         assert bool(denials.at_once(S)) == grows

@@ -6,7 +6,7 @@ one thing in common: the motion between them and what was known before. So the s
 (`Tracking.doubt_imu`), and they are left out where that explains what denied them by a motion that a vessel may have made. What
 follows is left out for half a second, and on for as long as its rates turn otherwise than the estimate does without them. Where
 wrong ones do not (an accelerometer) and are denied again, it is twice as long each time: an IMU that stays wrong costs a rebuild every
-few seconds, one that is right again is missed for about as long as it was wrong.
+few seconds, one that is right again is missed for seconds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from graphloc.time import duration_ns
 WHY = "contradicts the other sensors, which agree with each other"
 _SENSORS, _FEWEST, _MANY = 2, 2, 5  # that deny; measurements in a row of each, and of one of them at least
 _KEPT, _RIGHT = 50, 0.7  # measurements before these; share that must have agreed (with Cauchy at 1.5 sigmas, 0.87 do)
-_GROWS = 2.0  # times the square of the first residual in a row
+_GROWS = 4.0  # times the square of the first residual in a row
 _AT_ONCE_S = 2.5  # since the first denial: after that, a gap explains a jump of the fixes as well
 _BEFORE_S = 0.3  # the wrong samples begin before anything denies them
 _AGAIN_S = 1.0  # after a trial that explained nothing

@@ -448,7 +448,7 @@ class Tracking:
         if doubt.underway:
             return ""
         return (
-            f"{self._setup.imu_name}: from {utc_text(since_ns)} on it {WHY} ({', '.join(sorted(denied))}): its samples are rejected, as in "
+            f"{self._setup.imu_name}: from {utc_text(since_ns)} on it {WHY} ({', '.join(sorted(denied))}): its samples are left out, as in "
             "an IMU gap, until they fit again"
         )
 
