@@ -550,6 +550,9 @@ def test_memory_does_not_grow() -> None:
     full = ("scatter._pairs", "scatter._squares", "scatter._bent", "heading_check._steps", "heading_check._fixes")
     # fill up to their limit
     remembered = {name for name in early if name.endswith(full) or ".sensor_noise._pairs" in name}
+    agreed = {name: size for name, size in late.items() if ".denials._agreed." in name}
+    assert 40 < max(agreed.values()) <= 50
+    remembered |= set(agreed)
     # 40 s: at most six pairs in five seconds
     assert max(size for name, size in late.items() if ".sensor_noise._pairs" in name) <= 54
     # 40 s: at the 10 Hz of states, at the 2 Hz of fixes

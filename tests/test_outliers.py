@@ -85,8 +85,8 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one(monkeypatch
     monkeypatch.setattr(_batch, "_OFTEN", np.inf)
     grown_deg: list[float] = []
 
-    def watched(problem: Any, values: Any, *args: Any) -> int:
-        used = grow(problem, values, *args)
+    def watched(problem: Any, values: Any, *args: Any, **options: Any) -> int:
+        used = grow(problem, values, *args, **options)
         yaw = [float(values.atPose3(keys.pose(k)).rotation().yaw()) for k in range(len(problem.timeline))]
         off = wrap_angle(np.array(yaw) - run.truth.at(problem.timeline.stamps_ns).yaw_rad)
         grown_deg.append(float(np.degrees(np.abs(off).max())))

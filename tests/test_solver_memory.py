@@ -98,8 +98,8 @@ def test_tree_and_graph_are_gone_before_memory_is_given_back_and_offsets_are_ask
     held: list[weakref.ref[Any]] = []
     said: list[str] = []
 
-    def solved(*arguments: Any) -> BatchResult:
-        result = solve_batch(*arguments)
+    def solved(*arguments: Any, **options: Any) -> BatchResult:
+        result = solve_batch(*arguments, **options)
         held.extend((weakref.ref(result.tree), weakref.ref(result.graph)))
         return result
 
