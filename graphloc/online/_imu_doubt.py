@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from graphloc.frames import Array
 from graphloc.time import duration_ns
 
-WHY = "contradicts the other sensors, which agree with each other"
 _SENSORS, _FEWEST, _MANY = 2, 2, 5  # that deny; measurements in a row of each, and of one of them at least
 _KEPT, _RIGHT = 50, 0.7  # measurements before these; share that must have agreed (with Cauchy at 1.5 sigmas, 0.87 do)
 _GROWS = 4.0  # times the square of the first residual in a row

@@ -20,7 +20,7 @@ from graphloc.measurements import ImuSample, ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._estimates import estimate_of
 from graphloc.online._heading_check import HeadingCheck
-from graphloc.online._imu_doubt import WHY, ImuDoubt, turns_otherwise
+from graphloc.online._imu_doubt import ImuDoubt, turns_otherwise
 from graphloc.online._intake import series_of
 from graphloc.online._lag import Lag
 from graphloc.online._ledger import OnlineLedger
@@ -32,6 +32,7 @@ from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
 from graphloc.online._start import LEAST_S
+from graphloc.solve._wrong_imu import WHY
 from graphloc.time import duration_ns, stamps_of, utc_text
 from graphloc.trajectory import Trajectory
 

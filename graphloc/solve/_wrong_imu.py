@@ -172,24 +172,22 @@ def _shortest(
     without: Callable[[int, int], _Found], begin: int, last: int, whole: _Found
 ) -> tuple[tuple[int, int], _Found]:
     """Return the shortest span that is about as probable as the whole, and its solution: both ends by bisection."""
-    a, wrong = begin, last
-    while wrong - a > 1:
-        middle = (a + wrong) // 2
-        found = without(middle, last)
-        if found.cost <= whole.cost + _WORSE:
-            a = middle
-        else:
-            wrong = middle
-    b, wrong = last, a
-    while b - wrong > 1:
-        middle = (b + wrong) // 2
-        found = without(a, middle)
-        if found.cost <= whole.cost + _WORSE:
-            b = middle
-        else:
-            wrong = middle
+
+    def good(a: int, b: int) -> bool:
+        return without(a, b).cost <= whole.cost + _WORSE
+
+    a = _farthest(lambda middle: good(middle, last), begin, last)
+    b = _farthest(lambda middle: good(a, middle), last, a)
     a, b = max(a - 1, begin), min(b + 1, last)  # the ends as found may be wrong for a part of a state's time
     return (a, b), without(a, b)
+
+
+def _farthest(good: Callable[[int], bool], known: int, wrong: int) -> int:
+    """Return how far from `known` towards `wrong` it is still good, by bisection."""
+    while abs(wrong - known) > 1:
+        middle = (known + wrong) // 2
+        known, wrong = (middle, wrong) if good(middle) else (known, middle)
+    return known
 
 
 def _agreeing(
