@@ -137,20 +137,22 @@ def slow_at(problem: Problem, values: gtsam.Values, j: int) -> dict[int, Array]:
 
 
 def fill_slow(problem: Problem, values: gtsam.Values, j: int, bias: Any, slow: dict[int, Array]) -> None:
-    values.insert(keys.bias(j), bias)
+    values.insert_or_assign(keys.bias(j), bias)
     for stream in problem.streams:
         if stream.slow is not None:
-            values.insert(keys.slow(stream.number, j), slow.get(stream.number, np.zeros(len(stream.slow.sigma))))
+            values.insert_or_assign(
+                keys.slow(stream.number, j), slow.get(stream.number, np.zeros(len(stream.slow.sigma)))
+            )
 
 
 def dead_reckon(problem: Problem, values: gtsam.Values, known: int, until: int) -> None:
-    """Dead-reckon from state `known` to `until`."""
+    """Dead-reckon from state `known` to `until`, in place; what was there is replaced."""
     for k in range(known, until):
         j, following = (int(problem.timeline.slow_of[i]) for i in (k, k + 1))
         bias = values.atConstantBias(keys.bias(j))
         state = problem.preintegrated[k].predict(nav_state(values, k), bias)
-        values.insert(keys.pose(k + 1), state.pose())
-        values.insert(keys.velocity(k + 1), np.asarray(state.velocity()))
+        values.insert_or_assign(keys.pose(k + 1), state.pose())
+        values.insert_or_assign(keys.velocity(k + 1), np.asarray(state.velocity()))
         if following != j:
             fill_slow(problem, values, following, bias, slow_at(problem, values, j))
 

@@ -16,8 +16,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc import keys
-from graphloc.build import Past, Problem, StartPrior, nav_state, without_imu
+from graphloc.build import Past, Problem, StartPrior, without_imu
 from graphloc.chi2 import chi2_95
 from graphloc.errors import SolveError
 from graphloc.frames import Array
@@ -25,7 +24,7 @@ from graphloc.ledger import Outcome
 from graphloc.recording import Recording
 from graphloc.solve._decide import AGREES, met
 from graphloc.solve._passes import cost_as_configured
-from graphloc.solve._stretch import copy_states, slow_at
+from graphloc.solve._stretch import copy_states, dead_reckon
 from graphloc.time import NS_PER_S, utc_text
 
 WHY = "contradicts the other sensors, which agree with each other"
@@ -102,9 +101,9 @@ def wrong_span(
         values.update(as_is)
         values.update(before)
         stamps_ns = problem.timeline.stamps_ns
-        _dead_reckon_anew(problem, values, known, max(a, known))
+        dead_reckon(problem, values, known, max(a, known))
         rest = without_imu(problem, values, int(stamps_ns[a]), int(stamps_ns[b]))
-        _dead_reckon_anew(rest, values, a, last)
+        dead_reckon(rest, values, a, last)
         solve(rest)
         found = cost_as_configured(rest, values, first, last, prior, judged=last) + _PRICE * (b - a)
         return _Found(rest, found, copy_states(rest, values, first, last))
@@ -130,21 +129,6 @@ def wrong_span(
         pass  # the window stands as it is
     values.update(as_is)
     return span
-
-
-def _dead_reckon_anew(problem: Problem, values: gtsam.Values, known: int, until: int) -> None:
-    """Replace the states after `known` until another by dead reckoning, and their slow states by those of `known`."""
-    slow_of = problem.timeline.slow_of
-    j = int(slow_of[known])
-    bias, slow = values.atConstantBias(keys.bias(j)), slow_at(problem, values, j)
-    for k in range(known, until):
-        state = problem.preintegrated[k].predict(nav_state(values, k), bias)
-        values.update(keys.pose(k + 1), state.pose())
-        values.update(keys.velocity(k + 1), np.asarray(state.velocity()))
-    for node in range(j + 1, int(slow_of[until]) + 1):
-        values.update(keys.bias(node), bias)
-        for number, value in slow.items():
-            values.update(keys.slow(number, node), value)
 
 
 def _contradicted(problem: Problem, values: gtsam.Values, first: int, begin: int, last: int) -> bool:
