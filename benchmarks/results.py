@@ -20,6 +20,7 @@ from typing import Any
 import batch
 import calibration
 import compass
+import dead_reckoning
 import docking
 import drawn
 import drills
@@ -68,6 +69,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "E.4": online.shuffled,
     "E.5": online_faults.faults,
     "E.6": online.odometry,
+    "E.dark": dead_reckoning.figures,
     "E.imu": wrong_imu.figures,
     "F.3": batch.figures,
     "F.3p": where.figures,

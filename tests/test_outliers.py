@@ -24,9 +24,10 @@ from graphloc.position_jumps import JumpDetector, OffPrediction, PositionJump, j
 from graphloc.recording import Recording
 from graphloc.replay import arrivals, replay
 from graphloc.solution import Health, Solution
-from graphloc.solve import _batch
-from graphloc.solve._decide import Stage, _by_kernel
+from graphloc.solve import _batch, _grow
+from graphloc.solve._decide import Stage, _by_kernel, weigh
 from graphloc.solve._grow import grow
+from graphloc.solve._stretch import StretchStep, solve_stretch
 from tests.slowly import simulate_slowly, with_few_states
 
 _FINE_FIXES = Scenario(gnss_sigma_m=0.05, gnss_reported_sigma_m=0.21, imu_hz=50.0)
@@ -98,6 +99,29 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one(monkeypatch
     assert grown_deg[0] < 3.0
     assert off_deg < 3.0
     assert solved.ledger.counts()["matcher"]["used"] > 30
+
+
+@pytest.mark.parametrize("off_deg", [0.0, 90.0])
+def test_gentle_losses_are_tried_where_a_sensor_disagrees_not_where_dead_reckoning_was_far_off(
+    monkeypatch: pytest.MonkeyPatch, off_deg: float
+) -> None:
+    run = simulate_slowly(replace(_FINE_FIXES, path="loops", duration_s=40.0, gnss_hz=2.0, compass_hz=2.0), 1)
+    stages, moved_m = list[Stage](), list[float]()
+
+    def weighed(*args: Any, stage: Stage, **options: Any) -> Any:
+        stages.append(stage)
+        return weigh(*args, stage=stage, **options)
+
+    def solved(*args: Any, **options: Any) -> StretchStep:
+        step = solve_stretch(*args, **options)
+        moved_m.append(step.moved_m)
+        return step
+
+    monkeypatch.setattr(_grow, "weigh", weighed)
+    monkeypatch.setattr(_grow, "solve_stretch", solved)
+    _heading_off_deg(run, off_deg, 20.0, 40.0)
+    assert max(moved_m) > 2.0
+    assert (Stage.FAR in stages) == (off_deg != 0.0)
 
 
 def test_outliers_in_a_row_are_told_from_scattered_ones() -> None:
