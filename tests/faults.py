@@ -97,17 +97,18 @@ class Fed:
 
 def feed(smoother: OnlineSmoother, run: SimulatedRun, arrivals: Sequence[Arrival], fed: Fed | None = None) -> Fed:
     """Feed a stream, and compare with the truth; the stream goes on."""
-    fed = fed or Fed()
+    fed, begin = fed or Fed(), len(fed.estimates) if fed else 0
     for a in arrivals:
         estimate = smoother.feed(a.m)
         fed.rows += smoother.rows()
         fed.events += [event.text for event in smoother.events()]
         if estimate is not None:
             fed.estimates.append(estimate)
-            true_ns = estimate.stamp_ns - (a.m.stamp_ns - a.true_ns)
-            fed.true_ns.append(true_ns)
-            off = estimate.p_world_m - run.truth.at(np.array([true_ns])).p_world_m[0]
-            fed.errors_m.append(float(np.hypot(off[0], off[1])))
+            fed.true_ns.append(estimate.stamp_ns - (a.m.stamp_ns - a.true_ns))
+    if len(fed.estimates) > begin:
+        true_m, _ = run.truth.poses_at(np.array(fed.true_ns[begin:]))
+        off_m = np.array([e.p_world_m for e in fed.estimates[begin:]]) - true_m
+        fed.errors_m += np.hypot(off_m[:, 0], off_m[:, 1]).tolist()
     return fed
 
 
