@@ -412,7 +412,7 @@ def test_a_long_first_window_is_not_dead_reckoned_at_once() -> None:
     measurements = tuple(sorted([*fixes, *velocities], key=lambda m: m.stamp_ns))
     velocity = VelocityConfig(topic="/velocity", mount=run.config.sensors["gnss"].mount)
     sensors = {n: run.config.sensors[n] for n in ("imu", "gnss", "height")} | {"velocity": velocity}
-    config = with_few_states(run.config.model_copy(update={"sensors": sensors}))
+    config = with_few_states(run.config.model_copy(update={"sensors": sensors}), rate_hz=1.25)
     datum = app.choose_datum(run.recording, config)
     recording = app.with_synthetic(replace(run.recording, measurements=measurements), config, datum)
     problem = make_problem(recording, config, datum, SENSORS, INERTIAL)

@@ -324,7 +324,7 @@ def jumping(
     hz: float, sigma_m: float, slow_m: float, jump_m: float, begin_s: float, lasts_s: float = 9.0
 ) -> tuple[SimulatedRun, Arrivals, int, int]:
     """A receiver alone, with IMU and compass, that jumps: the run, what arrives, and when the jump begins and ends."""
-    scenario = replace(bl_scenario(1, "clean"), duration_s=lasts_s + 19.0, path="loops", imu_hz=50.0, gnss_hz=hz, gnss_sigma_m=sigma_m)  # fmt: skip
+    scenario = replace(bl_scenario(1, "clean"), duration_s=lasts_s + 14.0, path="loops", imu_hz=50.0, compass_hz=2.0, gnss_hz=hz, gnss_sigma_m=sigma_m)  # fmt: skip
     run = slowly(simulate(scenario, 1), max(hz, RATE_HZ))
     gnss = run.config.sensors["gnss"]
     assert isinstance(gnss, GnssConfig)
@@ -349,10 +349,10 @@ def jumping(
 @pytest.mark.parametrize(
     ("hz", "sigma_m", "slow_m", "jump_m", "begin_s", "bound_m"),
     [
-        (5.0, 0.02, 0.03, 10.0, 12.6, 0.5),  # early and late in the slow node of a second
-        (5.0, 0.02, 0.03, 10.0, 13.1, 0.5),
-        (5.0, 0.45, 2.0, 7.0, 13.1, 2.0),  # hidden in the noise of single fixes
-        (0.55, 0.1, 2.0, 7.0, 13.1, 2.0),  # and in what a vessel may go between two
+        (5.0, 0.02, 0.03, 10.0, 8.6, 0.5),  # early and late in the slow node of a second
+        (5.0, 0.02, 0.03, 10.0, 9.1, 0.5),
+        (5.0, 0.45, 2.0, 7.0, 9.1, 2.0),  # hidden in the noise of single fixes
+        (0.55, 0.1, 2.0, 7.0, 9.1, 2.0),  # and in what a vessel may go between two
     ],
 )
 def test_a_receiver_alone_whose_jump_the_imu_shows(
@@ -367,7 +367,7 @@ def test_a_receiver_alone_whose_jump_the_imu_shows(
 
 def hung(hz: float, lasts_s: float) -> tuple[SimulatedRun, Arrivals, int, int]:
     """As `jumping`, but the receiver repeats one fix instead."""
-    run, base, begin, end = jumping(hz, 0.45, 2.0, 0.0, 13.1, lasts_s)
+    run, base, begin, end = jumping(hz, 0.45, 2.0, 0.0, 9.1, lasts_s)
     held = next(a.m.position for a in base if isinstance(a.m, GnssPosition) and a.true_ns >= begin)
     repeated = [
         replace(a, m=replace(a.m, position=held)) if isinstance(a.m, GnssPosition) and begin <= a.true_ns < end else a
@@ -447,7 +447,7 @@ def test_an_estimate_that_restarts_takes_a_receiver_that_repeats_a_fix_as_it_is(
 
 def test_a_jump_is_found_among_many_fixes_to_a_state() -> None:
     """Those between its detection and the rebuild were off as well: all fixes of the window were held out, and it was lost."""
-    run, jumped, _, _ = jumping(20.0, 0.45, 2.0, 7.0, 13.1)
+    run, jumped, _, _ = jumping(20.0, 0.45, 2.0, 7.0, 9.1)
     run = slowly(run)
     fed = finish(online := smoother(run), feed(online, run, jumped))
     assert len([e for e in fed.events if "position jump" in e and "rebuilt" in e]) == 2
@@ -456,7 +456,7 @@ def test_a_jump_is_found_among_many_fixes_to_a_state() -> None:
 
 def test_a_window_that_is_rebuilt_amid_a_suspicion_has_the_fixes_before_it() -> None:
     """Where it turns out to be a burst of outliers, they come in no second time."""
-    run, jumped, begin, end = jumping(5.0, 0.45, 2.0, 7.0, 13.1)
+    run, jumped, begin, end = jumping(5.0, 0.45, 2.0, 7.0, 9.1)
     online, now = smoother(run), next(k for k, a in enumerate(jumped) if a.true_ns > begin + 600_000_000)
     fed = feed(online, run, jumped[:now])
     assert online._tracking is not None  # noqa: SLF001
@@ -476,7 +476,7 @@ def test_a_window_that_is_rebuilt_amid_a_suspicion_has_the_fixes_before_it() -> 
 
 
 def test_fixes_of_a_receiver_that_is_said_not_to_jump_are_used_after_a_jump() -> None:
-    run, jumped, _, end = jumping(5.0, 0.02, 0.03, 10.0, 12.6)
+    run, jumped, _, end = jumping(5.0, 0.02, 0.03, 10.0, 8.6, lasts_s=4.0)
     gnss = run.config.sensors["gnss"]
     assert isinstance(gnss, GnssConfig)
     steady = gnss.model_copy(update={"slow_error": gnss.slow_error.model_copy(update={"jumps": False})})
@@ -489,7 +489,7 @@ def test_fixes_of_a_receiver_that_is_said_not_to_jump_are_used_after_a_jump() ->
 
 def test_no_window_begins_where_a_jump_was_not_known_yet() -> None:
     """Estimates from between a jump and its detection have the slow error of before it: a rebuild 9 s later was 8 m off."""
-    run, jumped, begin, _ = jumping(5.0, 0.45, 2.0, 7.0, 13.1)
+    run, jumped, begin, _ = jumping(5.0, 0.45, 2.0, 7.0, 9.1)
     online = smoother(run)
     n = next(k for k, a in enumerate(jumped) if a.true_ns > begin + 1_800_000_000)
     fed = feed(online, run, jumped[:n])

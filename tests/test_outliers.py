@@ -572,7 +572,7 @@ def jumping_alone(
 ) -> tuple[SimulatedRun, Recording, VesselConfig]:
     """A run whose position one receiver measures, `off_m` off to the north from one second to another."""
     scenario = Scenario(
-        path="loops", duration_s=duration_s, noise="clean", pose_hz=0.0, compass_hz=5.0, imu_hz=50.0, gnss_hz=gnss_hz,
+        path="loops", duration_s=duration_s, noise="clean", pose_hz=0.0, compass_hz=1.0, imu_hz=50.0, gnss_hz=gnss_hz,
         gnss_sigma_m=sigma_m,
     )  # fmt: skip
     run = simulate(scenario, 1)

@@ -206,8 +206,7 @@ def fixed() -> Docked:
 
 @pytest.fixture(scope="module")
 def floating() -> Docked:
-    views = unlisted(voyage("floating", lasts_s=60.0), 232, 0.3, 3.0)
-    return dock("floating", views=views, lasts_s=60.0, rate_hz=3.0)
+    return dock("floating", views=unlisted(voyage("floating"), 232, 0.3, 3.0), rate_hz=3.0)
 
 
 @pytest.fixture(scope="module")
@@ -356,7 +355,7 @@ def test_tags_that_face_the_other_way_in_the_survey_are_named() -> None:
         roll, pitch, yaw = tag.rpy_deg
         return tag.model_copy(update={"rpy_deg": (roll, pitch, yaw + 180.0)})
 
-    said = dock(tag=turned, lasts_s=40.0, rate_hz=1.0).said
+    said = dock(tag=turned, lasts_s=20.0, rate_hz=1.0, route_s=30.0).said
     assert "tag 226, tag 227, tag 228: by the fixes they are seen from behind" in said
     assert "elsewhere than its mount says" not in said
 
@@ -446,12 +445,12 @@ def turned(by_deg: float, axis: str = "z") -> Change:
     return lambda m: replace(m, R_body_camera=about @ m.R_body_camera) if isinstance(m, TagSighting) else m
 
 
-@pytest.mark.parametrize(("kind", "costs_m", "rate_hz"), [("fixed", 0.02, 1.0), ("floating", 0.10, 2.0)])
+@pytest.mark.parametrize(("kind", "costs_m", "rate_hz"), [("fixed", 0.02, 1.0), ("floating", 0.10, 3.0)])
 def test_a_camera_whose_mount_is_measured_by_hand_serves_as_well(
-    kind: str, costs_m: float, rate_hz: float, fixed: Docked
+    kind: str, costs_m: float, rate_hz: float, fixed: Docked, floating: Docked
 ) -> None:
     """By 3 deg it is off; that was 1.8 m at the berth, where every sighting was refused, and 2.7 deg of heading."""
-    right = fixed if kind == "fixed" else dock(kind, rate_hz=rate_hz)
+    right = {"fixed": fixed, "floating": floating}[kind]
     docked = dock(kind, change=turned(3.0), rate_hz=rate_hz)
     assert docked.outcomes() == right.outcomes()
     assert docked.number("berth_p95_m") < right.number("berth_p95_m") + costs_m
