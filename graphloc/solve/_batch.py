@@ -69,6 +69,7 @@ LARGEST_NOISE_SCALE = 10.0  # no IMU is so many times noisier than configured
 _EXPLAINED = 2.0
 # Share of a sensor's measurements that disagree, from which the run is tried without it; and below which it tells the heading.
 _OFTEN, _MOSTLY = 0.3, 0.7
+_SHORTER_S = 10.0, 5.0  # first windows, where the usual one contradicts itself
 _CLEARLY = 10.0  # log-likelihood by which a solution must be more probable
 
 
@@ -263,6 +264,8 @@ def _off_for_long(off: NDArray[np.bool_]) -> bool:
 def _begin(problem: Problem, few: Thinned, progress: Progress, *, newest: bool, doubt_imu: bool = False) -> Begun:
     """Start a run, grow it over the thinned one, and fill in the other states."""
     begun = solve_start(few.problem, align(problem), progress, newest=newest)
+    if doubt_imu and begun.excess >= CONTRADICTION:
+        _doubt_at_once(few.problem, begun.last, progress)
     grown, prior, known, iterations, *_ = begun
     iterations += grow(few.problem, grown, prior, known, progress, doubt_imu=doubt_imu)
     grown, used, _ = rough_passes(few.problem, grown, prior, progress, (Stage.FINAL,), _SEAM_PASSES)
@@ -273,6 +276,25 @@ def _begin(problem: Problem, few: Thinned, progress: Progress, *, newest: bool, 
         iterations=iterations + used,
         heading_var=np.interp(stamps, few_stamps, begun.heading_var),
     )
+
+
+def _doubt_at_once(problem: Problem, last: int, progress: Progress) -> None:
+    """Look for an IMU that is wrong in the first window, until state `last`: it spoils all that is aligned and solved there.
+
+    So the run is begun with less of it, and grown from there.
+
+    Raises:
+        ImuWrong: it is.
+    """
+    config = problem.config
+    for window_s in _SHORTER_S:
+        start = config.start.model_copy(update={"window_s": window_s})
+        shorter = replace(problem, config=config.model_copy(update={"start": start}))
+        try:
+            values, prior, known, *_ = solve_start(shorter, align(shorter), progress, newest=True, window_s=window_s)
+            grow(problem, values, prior, known, progress, doubt_imu=True, last=last)
+        except SolveError:
+            continue
 
 
 def _from_there(problem: Problem, few: Thinned, begun: Begun, progress: Progress) -> _Solved:

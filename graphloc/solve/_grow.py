@@ -41,8 +41,9 @@ def grow(
     overlap_s: float = _OVERLAP_S,
     watch: Callable[[int, Verdicts], None] = lambda _last, _verdicts: None,
     doubt_imu: bool = False,
+    last: int | None = None,
 ) -> int:
-    """Take the estimate of states 0..known to the end of the run, a chunk at a time, in place; return the iterations.
+    """Take the estimate of states 0..known to state `last` (None: of the run), a chunk at a time, in place; return the iterations.
 
     Args:
         chunk_s, overlap_s: how far a step goes, and how far back its window reaches.
@@ -52,7 +53,8 @@ def grow(
     Raises:
         ImuWrong: there are some.
     """
-    stamps, slow_of, end = problem.timeline.stamps_ns, problem.timeline.slow_of, len(problem.timeline) - 1
+    stamps, slow_of = problem.timeline.stamps_ns, problem.timeline.slow_of
+    end = len(problem.timeline) - 1 if last is None else last
     prior: StartPrior | Past = start
     verdicts = weigh(problem, estimate, first=0, last=known, stage=Stage.FINAL)
     step = solve_stretch(problem, estimate, 0, known, prior, decisions(verdicts))

@@ -43,6 +43,8 @@ _FREE = 1e4  # 1 sigma, m or rad, of what is not held
 class Begun(NamedTuple):
     """The start of a run: values, prior, the last state solved, iterations, how many headings explain it, and what it was aligned to.
 
+    `excess`: its cost over what is expected, at least 1.
+
     `heading_var`: (last + 1,), rad^2, of each state, from how much other headings cost (at both ends, linear in between); 0 where the
     motion excludes those beside the solved one, or a sensor tells it.
     """
@@ -54,16 +56,20 @@ class Begun(NamedTuple):
     headings: int
     heading_var: Array
     start: Start
+    excess: float
 
 
-def solve_start(problem: Problem, start: Start, progress: Progress, *, newest: bool = False) -> Begun:
+def solve_start(
+    problem: Problem, start: Start, progress: Progress, *, newest: bool = False, window_s: float | None = None
+) -> Begun:
     """Try each candidate on the first window; look further while several explain it; keep the cheapest.
 
     Args:
         newest: `heading_var` is asked for at the last state alone; it is that of all.
+        window_s: look no further than this, even where several explain it; by default as far as is needed.
     """
-    seconds, iterations, until = max(start.window_s, _placed_s(problem)), 0, 0
-    longest_s = _LONGEST_UNTOLD_S if start.by_motion else _LONGEST_S
+    seconds, iterations, until = max(window_s or start.window_s, _placed_s(problem)), 0, 0
+    longest_s = window_s or (_LONGEST_UNTOLD_S if start.by_motion else _LONGEST_S)
     candidates = [_candidate(problem, start, yaw) for yaw in start.yaws_rad]
     while True:
         known, until = until, _index_after(problem, seconds)
@@ -85,7 +91,7 @@ def solve_start(problem: Problem, start: Start, progress: Progress, *, newest: b
                 first_var = last_var if newest else _var_at(problem, start, best, until, 0)
                 stamps = problem.timeline.stamps_ns[: until + 1]
                 heading_var = np.interp(stamps, stamps[[0, -1]], (first_var, last_var))
-            return Begun(best.values, best.prior, until, iterations, len(candidates), heading_var, start)
+            return Begun(best.values, best.prior, until, iterations, len(candidates), heading_var, start, best.excess)
         seconds *= 1.6
 
 
