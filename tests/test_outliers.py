@@ -124,6 +124,18 @@ def test_gentle_losses_are_tried_where_a_sensor_disagrees_not_where_dead_reckoni
     assert (Stage.FAR in stages) == (off_deg != 0.0)
 
 
+@pytest.mark.parametrize("off", [0.5, 20.0])
+def test_a_sensor_agrees_by_its_loss_as_configured_not_as_widened(off: float) -> None:
+    config = SimpleNamespace(kernel=KernelConfig(kind="cauchy", scale=1.5))
+    problem: Any = SimpleNamespace(streams=[SimpleNamespace(number=3, row=SimpleNamespace(false=None), config=config)])
+    residual = Residual(
+        raw=np.full(1, off), cov=np.eye(1), jacobian=lambda: np.zeros((1, 6)), prior=1.0, size_m=None, size_deg=None
+    )
+    verdicts: Any = {(3, i): SimpleNamespace(weight=0.9, residual=residual) for i in range(5)}
+    assert _grow._agree(problem, verdicts) == (off < 1.0)  # noqa: SLF001
+    assert not _grow._agree(problem, {})  # noqa: SLF001
+
+
 def test_outliers_in_a_row_are_told_from_scattered_ones() -> None:
     scattered = np.random.default_rng(1).random(200) < 0.4
     assert not _batch._off_for_long(scattered)  # noqa: SLF001

@@ -147,8 +147,8 @@ def _solve_without(
     """Solve a window without its new hypotheses, in place; return the step, its verdicts, and the iterations.
 
     Where it moves far and sensors disagree still when judged there, gentle losses may have to lead back. They also follow a sensor that
-    is wrong: a compass that is 90 deg off for the whole window bends the gyroscope's bias. So of the solution with them and the one
-    before, the less costly stays.
+    is wrong: a compass that is 90 deg off for the whole window bends the gyroscope's bias. So of the solution with them and those
+    before, the least costly stays.
     """
 
     def solved(stage: Stage) -> tuple[StretchStep, Verdicts]:
@@ -163,15 +163,15 @@ def _solve_without(
     iterations = step.iterations
     if step.moved_m < _FAR_SETTLED_M:
         return step, verdicts, iterations
-    begin = copy_states(problem, values, first, last)
+    begin, found = copy_states(problem, values, first, last), list[tuple[float, StretchStep, Verdicts]]()
     for _ in range(_MAX_ROUNDS):
-        as_it_is, judged = solved(Stage.FINAL)
-        iterations += as_it_is.iterations
-        if as_it_is.moved_m < _FAR_SETTLED_M:
+        step, verdicts = solved(Stage.FINAL)
+        iterations += step.iterations
+        found.append((cost(), step, verdicts))
+        if step.moved_m < _FAR_SETTLED_M:
             break
-    if as_it_is.moved_m < _FAR_SETTLED_M and _agree(problem, judged):
-        return as_it_is, judged, iterations
-    lowest = cost()
+    if step.moved_m < _FAR_SETTLED_M and _agree(problem, verdicts):
+        return step, verdicts, iterations
     update_states(problem, values, begin, first, last)
     for _ in range(_MAX_FAR_ROUNDS):
         step, _ = solved(Stage.FAR)
@@ -180,17 +180,18 @@ def _solve_without(
             break
     step, verdicts = solved(Stage.FINAL)
     iterations += step.iterations
-    if cost() < lowest:
-        return step, verdicts, iterations
-    update_states(problem, values, as_it_is.values, first, last)
-    return as_it_is, judged, iterations
+    found.append((cost(), step, verdicts))
+    _, step, verdicts = min(found, key=lambda f: f[0])
+    update_states(problem, values, step.values, first, last)
+    return step, verdicts, iterations
 
 
 def _agree(problem: Problem, verdicts: Verdicts) -> bool:
-    """Whether most measurements agree of each sensor that is judged by a loss."""
-    by_loss = {stream.number for stream in problem.streams if stream.row.false is None}
-    weights: dict[int, list[float]] = {number: [] for number in by_loss}
+    """Whether most measurements agree of each sensor that is judged by a loss, as wide as configured."""
+    by_loss = {stream.number: stream.config.kernel for stream in problem.streams if stream.row.false is None}
+    agree: dict[int, list[bool]] = {number: [] for number in by_loss}
     for (number, _), verdict in verdicts.items():
-        if number in by_loss:
-            weights[number].append(verdict.weight)
-    return all(np.mean(np.array(found) >= AGREES) >= _MOSTLY for found in weights.values() if found)
+        if (kernel := by_loss.get(number)) is not None:
+            agree[number].append(kernel.weight(verdict.residual.nis() / len(verdict.residual.raw)) >= AGREES)
+    judged = [found for found in agree.values() if found]
+    return bool(judged) and all(np.mean(found) >= _MOSTLY for found in judged)
