@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from graphloc import app
-from graphloc.build import closing_variance, slow_begin, slow_end, slow_step
+from graphloc.build import at_level, closing_variance, slow_begin, slow_end, slow_step
 from graphloc.config import GnssConfig, VelocityConfig, VesselConfig
 from graphloc.eval.drill.failures import script
 from graphloc.eval.metrics import TruthMetrics, compare_to_truth
@@ -86,6 +86,28 @@ def test_of_two_levels_the_longer_one_is_the_usual_one() -> None:
         np.hypot(*chain(process(), levels(14, 46, (8.0, -7.6, 0.0)), jumps=True)[0].atVector(PLACE)[:2] - (8.0, -7.6))
         < 2.5
     )
+
+
+def test_a_level_that_is_known_holds_its_nodes_alone() -> None:
+    """Information about 0 of a chain of 6 s, at its usual level from 2 to 4 s: 1/2 of the process at either end of it, dt/2T in between."""
+    of, n = process(), 7
+    usual = np.array([False, False, True, True, True, False, False])
+    graph, at = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for j in range(n):
+        at.insert(j, np.zeros(3))
+    priors = [*slow_begin(of, 0, np.zeros(3), far=False), *slow_end(of, n - 1, far=False)]
+    steps = [slow_step(of, j, j + 1, 1.0, far=False) for j in range(n - 1)]
+    for factor in [*priors, *(f for step in steps for f in step), *at_level(of, range(n), np.ones(n - 1), usual)]:
+        graph.add(factor)
+    held = np.zeros((n, 3))
+    for k in range(graph.size()):
+        if len(names := graph.at(k).keys()) == 1:
+            held[names[0]] += np.diagonal(graph.at(k).linearize(at).information())[:3]
+    held *= of.sigma**2
+    walk = 1.0 / (2.0 * of.time_constant_s[0])
+    np.testing.assert_allclose(held[:, 0], [0.0, 0.0, 0.5 + walk, walk, 0.5 + walk, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(held[:, 1], held[:, 0], atol=1e-9)
+    np.testing.assert_allclose(held[:, 2], [0.5, *[walk] * 5, 0.5 + walk], atol=1e-9)  # up does not stay far off
 
 
 def test_a_height_far_off_does_not_set_the_place_free() -> None:

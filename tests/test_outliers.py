@@ -486,6 +486,18 @@ def test_a_jump_of_the_only_receiver_is_not_followed_where_the_imu_contradicts_i
     assert any("position jump of 12 m" in w and "treated as its error" in w for w in found.stats.warnings)
 
 
+@pytest.mark.parametrize("off_m", [10.0, 40.0])
+def test_a_run_that_begins_in_a_jump_of_the_only_receiver_is_led_back(off_m: float) -> None:
+    """For 10 s of 40. The right level was chosen, and the passes led away from it: 8 and 40 m off."""
+    run, recording, config = jumping_alone(5.0, (0.0, 10.0), 40.0, off_m=off_m)
+    found = app.smooth_recording(recording, config).solution
+    off = compare_to_truth(found.trajectory, run.truth)
+    assert off.position_max_m < 2.5  # 1.3 sigma of the slow error that nothing separates from the position
+    assert off.coverage_95 is not None
+    assert off.coverage_95 > 0.95
+    assert any("held longest" in w for w in found.stats.warnings)
+
+
 @pytest.mark.parametrize("gnss_hz", [1.0, 5.0])
 def test_a_jump_of_the_only_receiver_is_not_followed_online(gnss_hz: float) -> None:
     """12 m for 12 s, and back. It was followed within seconds, past the fixes, with the heading turned."""

@@ -5,18 +5,20 @@ A slow error is a first-order Gauss-Markov process (sigma s, time constant T), b
 exp(-int x'^2/2q - int x^2/2p) with q = 2 s^2/T, p = 2 s^2 T, and x^2/4s^2 at both ends, is a random walk with a prior
 about 0 at each node. That is exact as the node period goes to 0, and leaves the steps free for a robust loss (a
 `JacobianFactor` that contains the decay takes none); the priors, too: components that may stay far off (`SlowProcess.far`)
-have tails, w = 1 / (1 + x^2 / (F s)^2), on all of their part of the measure, so that of two levels one is the usual one.
+have tails, w = 1 / (1 + x^2 / (F s)^2), on all of their part of the measure, so that of two levels one is the usual one. Once it
+is known which, only the nodes at that level have a prior (`at_level`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.config import KernelConfig
@@ -38,15 +40,19 @@ def bias_step(links: InertialLink, j: int, dt_s: float) -> Any:
     return gtsam.BetweenFactorConstantBias(keys.bias(j), keys.bias(j + 1), gtsam.imuBias.ConstantBias(), model)
 
 
-def slow_begin(slow: SlowProcess, key: int, known: Array, *, jumps: bool = True) -> Iterator[Any]:
-    """Yield the priors of the first node of a chain; `known` (k,): its estimate, which sets the tails of constant components."""
+def slow_begin(slow: SlowProcess, key: int, known: Array, *, jumps: bool = True, far: bool = True) -> Iterator[Any]:
+    """Yield the priors of the first node of a chain.
+
+    Args:
+        known: (k,) its estimate, which sets the tails of constant components. jumps, far: as in `slow_step`.
+    """
     constant = slow.constant
     if constant.any():
         # Why tails: see `_add_constants` in `_graph.py`.
         tails = np.sqrt(1.0 + (known / slow.sigma) ** 2 / CONSTANT_TAILS)
         tails[[axis in slow.no_tails for axis in slow.axes]] = 1.0
         yield _prior(key, slow.sigma * np.where(constant, tails, _NOTHING))
-    yield from _standing(slow, key, np.full(len(constant), _CHAIN_END), jumps=jumps)
+    yield from _standing(slow, key, np.full(len(constant), _CHAIN_END), jumps=jumps, far=far)
 
 
 def slow_step(
@@ -56,13 +62,15 @@ def slow_step(
     dt_s: float,
     *,
     jumps: bool = True,
+    far: bool = True,
     jump_m: float = 0.0,
     expected: Array | None = None,
 ) -> Iterator[Any]:
     """Yield the factors of the step to the next node, `dt_s` later.
 
     Args:
-        jumps: whether steps have a robust loss. jump_m: size of a position jump seen in this step: it, or the vessel, has moved so far.
+        jumps: whether steps have a robust loss. far: whether components that may stay far off have a prior; else see `at_level`.
+        jump_m: size of a position jump seen in this step: it, or the vessel, has moved so far.
         expected: (k,) the step, where it is known besides.
     """
     constant = slow.constant
@@ -74,7 +82,7 @@ def slow_step(
     if slow.jumps and jumps and jump_m == 0.0:
         model = _with_tails(model, JUMP.scale)
     yield gtsam.BetweenFactorVector(key, following, np.zeros(len(step)) if expected is None else expected, model)
-    yield from _standing(slow, following, 2.0 * slow.time_constant_s / dt_s, jumps=jumps)
+    yield from _standing(slow, following, 2.0 * slow.time_constant_s / dt_s, jumps=jumps, far=far)
 
 
 def without_drift(slow: SlowProcess) -> SlowProcess:
@@ -82,9 +90,22 @@ def without_drift(slow: SlowProcess) -> SlowProcess:
     return replace(slow, time_constant_s=_NO_DRIFT * slow.time_constant_s)
 
 
-def slow_end(slow: SlowProcess, key: int, *, jumps: bool = True) -> Iterator[Any]:
-    """Yield the prior that closes a chain at its last node."""
-    yield from _standing(slow, key, np.full(len(slow.sigma), _CHAIN_END), jumps=jumps)
+def slow_end(slow: SlowProcess, key: int, *, jumps: bool = True, far: bool = True) -> Iterator[Any]:
+    """Yield the prior that closes a chain at its last node; `jumps`, `far` as in `slow_step`."""
+    yield from _standing(slow, key, np.full(len(slow.sigma), _CHAIN_END), jumps=jumps, far=far)
+
+
+def at_level(slow: SlowProcess, names: Sequence[int], dt_s: Array, usual: NDArray[np.bool_]) -> Iterator[Any]:
+    """Yield the priors of a chain's components that may stay far off, where it is known which nodes are at the usual level.
+
+    These have a Gaussian one, whose chain ends at the first and last of them; the others none, as a jump may lead anywhere.
+
+    Args:
+        names: (N,) the keys of the nodes. dt_s: (N - 1,) between them. usual: (N,).
+    """
+    held = _held(slow, dt_s, usual)
+    for n in np.flatnonzero(usual):
+        yield _prior(names[int(n)], slow.sigma * np.where(slow.far_axes, np.sqrt(1.0 / held[n]), _NOTHING))
 
 
 @lru_cache(maxsize=256)  # many measurements are equally far apart
@@ -121,20 +142,29 @@ def standing_cost(slow: SlowProcess, path: Array, dt_s: Array) -> float:
     """
     far = slow.far_axes
     square = ((path[:, far] / slow.sigma[far]) ** 2).sum(axis=1)
-    held = np.concatenate([[1.0 / _CHAIN_END], dt_s / (2.0 * float(slow.time_constant_s[far].max()))])
-    held[-1] += 1.0 / _CHAIN_END
+    held = _held(slow, dt_s, np.ones(len(path), dtype=bool))
     return float(held @ np.log1p(square / _FAR**2)) * _FAR**2 / 2.0
 
 
-def _standing(slow: SlowProcess, key: int, times: Array, *, jumps: bool) -> Iterator[Any]:
+def _held(slow: SlowProcess, dt_s: Array, usual: NDArray[np.bool_]) -> Array:
+    """Return the information (N,) of the priors about 0 of a chain that ends at the first and last of its `usual` nodes."""
+    held = np.concatenate([[0.0], dt_s / (2.0 * float(slow.time_constant_s[slow.far_axes].max()))])
+    if usual.any():
+        for end in np.flatnonzero(usual)[[0, -1]]:
+            held[end] += 1.0 / _CHAIN_END
+    return held
+
+
+def _standing(slow: SlowProcess, key: int, times: Array, *, jumps: bool, far: bool) -> Iterator[Any]:
     """Yield the priors about 0 of a node, with `times` (k,) the variance of the process; constants have none.
 
-    Components that may stay far off have a prior of their own: a height above another zero must not loosen the horizontal ones.
+    Components that may stay far off have a prior of their own, or none (`far`): a height above another zero must not loosen the
+    horizontal ones.
     """
-    held, far = ~slow.constant, slow.far_axes & jumps
-    for part in (held & ~far, held & far):
+    held, tailed = ~slow.constant & (far | ~slow.far_axes), slow.far_axes & jumps
+    for part in (held & ~tailed, held & tailed):
         if part.any():
-            tails = _FAR / float(np.sqrt(times[part].max())) if far[part].all() else None
+            tails = _FAR / float(np.sqrt(times[part].max())) if tailed[part].all() else None
             yield _prior(key, slow.sigma * np.where(part, np.sqrt(times), _NOTHING), tails)
 
 

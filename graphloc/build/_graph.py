@@ -13,7 +13,7 @@ import numpy as np
 
 from graphloc import keys
 from graphloc.build._attach import constants_of
-from graphloc.build._chains import CONSTANT_TAILS, bias_step, slow_begin, slow_end, slow_step
+from graphloc.build._chains import CONSTANT_TAILS, at_level, bias_step, slow_begin, slow_end, slow_step
 from graphloc.build._problem import Problem, Stream
 from graphloc.frames import Array, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, SlowProcess
@@ -208,9 +208,11 @@ def _add_constants(
 
 
 @lru_cache(maxsize=1 << 14)
-def _step(slow: SlowProcess, key: int, following: int, dt_s: float, jumps: bool, jump_m: float) -> tuple[Any, ...]:
+def _step(
+    slow: SlowProcess, key: int, following: int, dt_s: float, jumps: bool, far: bool, jump_m: float
+) -> tuple[Any, ...]:
     """Factors of a step, made once: they do not depend on the estimate, so every graph shares them."""
-    return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, jump_m=jump_m))
+    return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, far=far, jump_m=jump_m))
 
 
 def _jumps_m(problem: Problem, stream: Stream) -> dict[int, float]:
@@ -263,15 +265,20 @@ def _add_slow_chain(
     jumps: bool,
 ) -> None:
     key = [keys.slow(stream.number, j) for j in nodes]
+    dt_s = [_node_dt_s(problem, j) for j in nodes[:-1]]
+    far = stream.usual is None
     if isinstance(prior, StartPrior):
         if (given := prior.slow.get(stream.number)) is not None:
             graph.add(gtsam.PriorFactorVector(key[0], given[0], gtsam.noiseModel.Gaussian.Covariance(given[1])))
         else:
-            for factor in slow_begin(slow, key[0], values.atVector(key[0]), jumps=jumps):
+            for factor in slow_begin(slow, key[0], values.atVector(key[0]), jumps=jumps, far=far):
                 graph.add(factor)
     sizes_m = _jumps_m(problem, stream)
     for n, j in enumerate(nodes[:-1]):
-        for factor in _step(slow, key[n], key[n + 1], _node_dt_s(problem, j), jumps, sizes_m.get(j, 0.0)):
+        for factor in _step(slow, key[n], key[n + 1], dt_s[n], jumps, far, sizes_m.get(j, 0.0)):
             graph.add(factor)
-    for factor in slow_end(slow, key[-1], jumps=jumps):
+    for factor in slow_end(slow, key[-1], jumps=jumps, far=far):
         graph.add(factor)
+    if stream.usual is not None:
+        for factor in at_level(slow, key, np.array(dt_s), stream.usual[nodes.start : nodes.stop]):
+            graph.add(factor)

@@ -43,6 +43,7 @@ class Stream:
             from the state before it; None where its stamp is that of a state.
         gyro_radps: (M, 3) raw rate at each measurement, body axes.
         apart_s: (M,) time since the measurement before; inf for the first.
+        usual: at which slow nodes (N,) its error is at its usual level; None: not known (see `solve/_levels.py`).
     """
 
     number: int
@@ -59,6 +60,7 @@ class Stream:
     carry: tuple[Carry | None, ...]
     gyro_radps: Array
     apart_s: Array
+    usual: NDArray[np.bool_] | None = None
 
     def between(self, first: int, last: int) -> range:
         """Indices of the measurements that attach to states first..last (inclusive)."""

@@ -152,7 +152,7 @@ def solve_batch(
         solved = as_stated.settled_again(begun.prior, progress)
         passes, iterations = passes + solved.settled.passes, iterations + solved.settled.iterations
     problem, last = solved
-    settled, levels_cov = at_usual_level(problem, last, begun.prior, progress, _LAST_PASSES)
+    problem, settled, prior, levels_cov = at_usual_level(problem, last, begun.prior, progress, _LAST_PASSES)
     if settled is not last:
         passes, iterations = passes + settled.passes, iterations + settled.iterations
     return BatchResult(
@@ -166,7 +166,7 @@ def solve_batch(
         cost=cost_without_outliers(settled),
         converged=settled.converged,
         noise_scale=problem.noise_scale,
-        prior=begun.prior,
+        prior=prior,
         heading_var=begun.heading_var,
         begun=begun.last,
         headings=begun.headings if begun.start.yaw_sigma_rad < np.pi else 0,
