@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
+from graphloc.solve._wrong_imu import GROWS
 from graphloc.time import duration_ns
 
 _SENSORS, _FEWEST, _MANY = 2, 2, 5  # that deny; measurements in a row of each, and of one of them at least
 _KEPT, _RIGHT = 50, 0.7  # measurements before these; share that must have agreed (with Cauchy at 1.5 sigmas, 0.87 do)
-_GROWS = 4.0  # times the square of the first residual in a row
 _AT_ONCE_S = 2.5  # since the first denial: after that, a gap explains a jump of the fixes as well
 _BEFORE_S = 0.3  # the wrong samples begin before anything denies them
 _AGAIN_S = 1.0  # after a trial that explained nothing
@@ -76,7 +76,7 @@ class Denials:
             return {}
         if any(sum(agreed) < _RIGHT * len(agreed) for agreed in map(self._agreed.__getitem__, begun)):
             return {}
-        if not any(last > _GROWS * first for first, last in (self._sizes[n] for n in begun if n in self._sizes)):
+        if not any(last > GROWS * first for first, last in (self._sizes[n] for n in begun if n in self._sizes)):
             return {}
         return {name: min(stamps) for name, stamps in begun.items()}
 

@@ -22,6 +22,7 @@ from scipy.linalg import block_diag
 
 from graphloc import keys
 from graphloc.build import Decided, Decisions, Judged, Problem, Sited, Stream, Thinned, attach
+from graphloc.chi2 import chi2_95
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
@@ -229,6 +230,14 @@ def by_hypotheses(
         kept = Decision(mode=mode, weight=weight) if weight > NEGLIGIBLE else None
         verdicts.append(Verdict(kept, weight, share, residuals[n][mode], mode, attached[n]))
     return verdicts
+
+
+def agrees(stream: Stream, residual: Residual) -> bool:
+    """Whether a residual agrees by the loss of its sensor, as wide as configured; of a sensor with hypotheses, whether 95 % are smaller."""
+    nis, dof = residual.nis(), len(residual.raw)
+    if stream.row.false is not None:
+        return nis < chi2_95(dof)
+    return stream.config.kernel.weight(nis / dof) >= AGREES
 
 
 def met(

@@ -10,7 +10,7 @@ import numpy as np
 
 from graphloc.build import Past, Problem, StartPrior, without_imu
 from graphloc.recording import Progress
-from graphloc.solve._decide import AGREES, PredictedCovariance, Stage, Verdicts, decisions, predicted_covariance, weigh
+from graphloc.solve._decide import PredictedCovariance, Stage, Verdicts, agrees, decisions, predicted_covariance, weigh
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import cost_as_configured
 from graphloc.solve._stretch import (
@@ -188,10 +188,10 @@ def _solve_without(
 
 def _agree(problem: Problem, verdicts: Verdicts) -> bool:
     """Whether most measurements agree of each sensor that is judged by a loss, as wide as configured."""
-    by_loss = {stream.number: stream.config.kernel for stream in problem.streams if stream.row.false is None}
+    by_loss = {stream.number: stream for stream in problem.streams if stream.row.false is None}
     agree: dict[int, list[bool]] = {number: [] for number in by_loss}
     for (number, _), verdict in verdicts.items():
-        if (kernel := by_loss.get(number)) is not None:
-            agree[number].append(kernel.weight(verdict.residual.nis() / len(verdict.residual.raw)) >= AGREES)
+        if (stream := by_loss.get(number)) is not None:
+            agree[number].append(agrees(stream, verdict.residual))
     judged = [found for found in agree.values() if found]
     return bool(judged) and all(np.mean(found) >= _MOSTLY for found in judged)

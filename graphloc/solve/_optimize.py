@@ -74,7 +74,7 @@ def _stepper(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> gtsam.Ga
 
 
 def _of(stepper: gtsam.GaussNewtonOptimizer) -> gtsam.Values:
-    """Return a copy of its values, which it gives back to the system at its next step."""
+    """Return a copy of its values: what `values` returns refers to memory that the next step frees."""
     return gtsam.Values(stepper.values())
 
 

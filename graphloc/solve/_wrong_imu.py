@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.build import Past, Problem, StartPrior, without_imu
-from graphloc.chi2 import chi2_95
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.ledger import Outcome
 from graphloc.recording import Recording
-from graphloc.solve._decide import AGREES, met
+from graphloc.solve._decide import agrees, met
 from graphloc.solve._passes import cost_as_configured
 from graphloc.solve._stretch import copy_states, dead_reckon
 from graphloc.time import NS_PER_S, utc_text
@@ -35,7 +34,7 @@ _SUSPECT, _TIMES = (
 _BEFORE_S = 2.5  # what is known before a window may be wrong already
 _PRICE, _CLEARLY = 1.0, 10.0  # log-likelihood: of each IMU factor that is left out, and of leaving out any
 _WORSE = 6.0  # log-likelihood by which a shorter span may be less probable
-_GROWS = 4.0  # times the square of the first residual in a row
+GROWS = 4.0  # times the square of the first residual in a row
 _IN_A_ROW = 3  # measurements of a sensor that disagree make it one that denies
 _SENSORS, _FEWEST = 2, 2  # that agree without the IMU, and with how many measurements more
 _MOTION = 3.0  # sigmas of the motion in a gap (`factors.imu`), once and per second
@@ -90,7 +89,7 @@ def wrong_span(
     agreed, squares = _agreeing(problem, values, begin, last)
     if not _contradicted(problem, values, first, begin, last) and sum(map(_denies, agreed)) < _SENSORS:
         return None
-    denying = [n for n, agrees in enumerate(agreed) if _denies(agrees)]
+    denying = [n for n, each in enumerate(agreed) if _denies(each)]
     if denying and not any(_grows(agreed[n], squares[n]) for n in denying):
         return None
     as_is = copy_states(problem, values, first, last)
@@ -149,7 +148,7 @@ def _grows(agreed: NDArray[np.bool_], squares: Array) -> bool:
     begin = int(np.argmax(np.convolve(~agreed, np.ones(_IN_A_ROW), "valid")))
     ends = np.flatnonzero(agreed[begin:])
     row = squares[begin : begin + int(ends[0]) if len(ends) else len(squares)]
-    return bool(row.max() > _GROWS * row[0])
+    return bool(row.max() > GROWS * row[0])
 
 
 def _shortest(
@@ -184,13 +183,7 @@ def _agreeing(
     found, squares = list[NDArray[np.bool_]](), list[Array]()
     for stream in problem.streams:
         modes = met(problem, stream, stream.between(first, last), values)[1]
-        nis = np.array([min(r.nis() for r in several) for several in modes])
-        dofs = [len(several[0].raw) for several in modes]
-        kernel, by_kernel = stream.config.kernel, stream.row.false is None
-        agrees = [
-            kernel.weight(each / dof) >= AGREES if by_kernel else each < chi2_95(dof)
-            for each, dof in zip(nis, dofs, strict=True)
-        ]
-        found.append(np.array(agrees, dtype=bool))
-        squares.append(nis)
+        nearest = [min(several, key=lambda r: r.nis()) for several in modes]
+        found.append(np.array([agrees(stream, residual) for residual in nearest], dtype=bool))
+        squares.append(np.array([residual.nis() for residual in nearest]))
     return found, squares
