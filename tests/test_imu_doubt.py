@@ -4,6 +4,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
+from types import SimpleNamespace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 
 from graphloc import app
 from graphloc.config import ImuConfig
+from graphloc.errors import SolveError
 from graphloc.eval.metrics import TrackErrors, errors
 from graphloc.factors.imu import ROW
 from graphloc.frames import Array
@@ -21,8 +24,10 @@ from graphloc.online import _lag
 from graphloc.online._imu_doubt import Denials, ImuDoubt, turns_otherwise
 from graphloc.online._lag import Lag
 from graphloc.online._tracking import Tracking
-from graphloc.recording import Recording
+from graphloc.recording import Recording, quiet
 from graphloc.solution import Health, Solution
+from graphloc.solve import _batch
+from graphloc.solve._start import Begun
 from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
 from tests.test_online_faults import at_s, run_of, smoother
 
@@ -157,6 +162,42 @@ def test_offline_it_is_found_in_the_first_window() -> None:
     assert np.linalg.norm(off.position_m[:, :2], axis=1).max() < 1.0
     assert np.abs(off.heading_rad).max() < np.radians(8.0)
     assert any("contradicts the other sensors, which agree" in w for w in solution.stats.warnings)
+
+
+def test_offline_it_is_not_blamed_for_a_compass_that_is_wrong_at_the_start() -> None:
+    """45 deg for 9 s, as beside a crane: samples of 19 s were left out, and the heading was 47 deg off."""
+
+    def beside_a_crane(m: Measurement) -> Measurement:
+        return replace(m, yaw_rad=m.yaw_rad + np.pi / 4.0) if isinstance(m, CompassHeading) else m
+
+    solution, _, off = smoothed(beside_a_crane, 0.0, 9.0)
+    assert not any("contradicts the other sensors, which agree" in w for w in solution.stats.warnings)
+    assert np.abs(off.heading_rad).max() < np.radians(1.0)
+    assert np.linalg.norm(off.position_m[:, :2], axis=1).max() < 0.5
+
+
+@pytest.mark.parametrize(("excess", "told"), [(1.5, False), (3.0, False), (3.0, True)])
+def test_offline_the_start_is_in_doubt_only_where_it_contradicts_itself(
+    excess: float, *, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And where no start without a sensor explains that. Without these conditions a right IMU was left out, and the run 9 m and 87 deg off."""
+    none: Any = None
+    begun = Begun(gtsam.Values(), none, 0, 0, 1, np.zeros(1), none, excess)
+    seen = []
+
+    def grow(*_: object, doubt_start: bool, **__: object) -> int:
+        seen.append(doubt_start)
+        raise SolveError("seen")
+
+    monkeypatch.setattr(_batch, "align", lambda _: None)
+    monkeypatch.setattr(_batch, "solve_start", lambda *_, **__: begun)
+    monkeypatch.setattr(_batch, "_begun_without_a_sensor", lambda *_: begun if told else None)
+    monkeypatch.setattr(_batch, "_doubt_at_once", lambda *_: None)
+    monkeypatch.setattr(_batch, "grow", grow)
+    few: Any = SimpleNamespace(problem=None)
+    with pytest.raises(SolveError, match="seen"):
+        _batch._begin(few, few, quiet, newest=False, doubt_imu=True)  # noqa: SLF001
+    assert seen == [excess > 2.5 and not told]
 
 
 @pytest.mark.parametrize("change", [compass_turns, both_off])

@@ -46,6 +46,7 @@ from graphloc.build._problem import (
     with_sensor_noise,
     with_usual_motion,
     without_imu,
+    without_sensor,
 )
 from graphloc.build._thinned import Thinned, thinned
 
@@ -93,4 +94,5 @@ __all__ = [
     "with_usual_motion",
     "without_drift",
     "without_imu",
+    "without_sensor",
 ]

@@ -168,6 +168,11 @@ def without_imu(problem: Problem, values: gtsam.Values, after_ns: int, until_ns:
     return _bridged(replace(problem, links=links, left_out=left_out, streams=streams), values, [(after_ns, until_ns)])
 
 
+def without_sensor(problem: Problem, stream: Stream) -> Problem:
+    """Return the problem without the measurements of one of its streams."""
+    return replace(problem, streams=tuple(s.silenced() if s is stream else s for s in problem.streams))
+
+
 def _carried_anew(stream: Stream, timeline: Timeline, links: InertialLink, after_ns: int, until_ns: int) -> Stream:
     """Return a stream whose measurements in a span are carried from their states by these links."""
     zero, carry, gyro = gtsam.imuBias.ConstantBias(), list(stream.carry), np.array(stream.gyro_radps)

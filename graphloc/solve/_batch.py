@@ -36,6 +36,7 @@ from graphloc.build import (
     with_noise_scale,
     with_sensor_noise,
     with_usual_motion,
+    without_sensor,
 )
 from graphloc.errors import SolveError
 from graphloc.frames import Array
@@ -228,9 +229,7 @@ def _first_solution(problem: Problem, progress: Progress, *, newest: bool, doubt
     iterations, passes = begun.iterations + solved.settled.iterations, solved.settled.passes
     del solved  # and its graph, before the next one is made
     for number in doubted:
-        streams = list(problem.streams)
-        streams[number] = streams[number].silenced()
-        rest = replace(problem, streams=tuple(streams))
+        rest = without_sensor(problem, problem.streams[number])
         try:
             begun = _begin(rest, thinned(rest), progress, newest=newest)
         except SolveError:
@@ -264,10 +263,13 @@ def _off_for_long(off: NDArray[np.bool_]) -> bool:
 def _begin(problem: Problem, few: Thinned, progress: Progress, *, newest: bool, doubt_imu: bool = False) -> Begun:
     """Start a run, grow it over the thinned one, and fill in the other states."""
     begun = solve_start(few.problem, align(problem), progress, newest=newest)
-    if doubt_imu and begun.excess >= CONTRADICTION:
+    doubt_start = doubt_imu and begun.excess >= CONTRADICTION
+    if doubt_start and (other := _begun_without_a_sensor(problem, few, begun, progress)) is not None:
+        begun, doubt_start = other, False
+    if doubt_start:
         _doubt_at_once(few.problem, begun.last, progress)
     grown, prior, known, iterations, *_ = begun
-    iterations += grow(few.problem, grown, prior, known, progress, doubt_imu=doubt_imu)
+    iterations += grow(few.problem, grown, prior, known, progress, doubt_imu=doubt_imu, doubt_start=doubt_start)
     grown, used, _ = rough_passes(few.problem, grown, prior, progress, (Stage.FINAL,), _SEAM_PASSES)
     stamps, few_stamps = problem.timeline.stamps_ns, few.problem.timeline.stamps_ns[: known + 1]
     return begun._replace(
@@ -276,6 +278,31 @@ def _begin(problem: Problem, few: Thinned, progress: Progress, *, newest: bool, 
         iterations=iterations + used,
         heading_var=np.interp(stamps, few_stamps, begun.heading_var),
     )
+
+
+def _begun_without_a_sensor(problem: Problem, few: Thinned, begun: Begun, progress: Progress) -> Begun | None:
+    """Return the start without one of the sensors of heading or velocity, if it contradicts itself no longer and is clearly more probable."""
+
+    def cost(values: gtsam.Values, prior: StartPrior, last: int) -> float:
+        return cost_as_configured(few.problem, values, 0, last, prior, judged=last)
+
+    for stream in few.problem.streams:
+        if stream.row.absolute or stream.row.false is not None or not stream.measurements:
+            continue
+        whole = next(s for s in problem.streams if s.number == stream.number)
+        rest, window_s = without_sensor(few.problem, stream), problem.config.start.window_s
+        try:
+            other = solve_start(rest, align(without_sensor(problem, whole)), progress, newest=True, window_s=window_s)
+        except SolveError:
+            continue
+        last = min(begun.last, other.last)
+        lower = cost(begun.values, begun.prior, last) - cost(other.values, other.prior, last)
+        if other.excess < CONTRADICTION and lower > _CLEARLY:
+            # The sensor may tell the heading after all.
+            return begun._replace(
+                values=other.values, prior=other.prior, last=other.last, heading_var=np.zeros(other.last + 1)
+            )
+    return None
 
 
 def _doubt_at_once(problem: Problem, last: int, progress: Progress) -> None:

@@ -41,6 +41,7 @@ def grow(
     overlap_s: float = _OVERLAP_S,
     watch: Callable[[int, Verdicts], None] = lambda _last, _verdicts: None,
     doubt_imu: bool = False,
+    doubt_start: bool = True,
     last: int | None = None,
 ) -> int:
     """Take the estimate of states 0..known to state `last` (None: of the run), a chunk at a time, in place; return the iterations.
@@ -48,7 +49,7 @@ def grow(
     Args:
         chunk_s, overlap_s: how far a step goes, and how far back its window reaches.
         watch: called with the last state of each window and the decisions in it, as known at that time.
-        doubt_imu: whether to look for spans in which the IMU is wrong.
+        doubt_imu: whether to look for spans in which the IMU is wrong. doubt_start: also in states 0..known.
 
     Raises:
         ImuWrong: there are some.
@@ -59,7 +60,8 @@ def grow(
     verdicts = weigh(problem, estimate, first=0, last=known, stage=Stage.FINAL)
     step = solve_stretch(problem, estimate, 0, known, prior, decisions(verdicts))
     iterations, first = step.iterations, 0
-    if doubt_imu and (found := _without_imu(problem, estimate, 0, 0, known, prior, gtsam.Values())) is not None:
+    found = _without_imu(problem, estimate, 0, 0, known, prior, gtsam.Values()) if doubt_imu and doubt_start else None
+    if found is not None:
         problem, step, verdicts, more = found
         iterations += more
     while known < end:

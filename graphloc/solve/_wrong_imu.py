@@ -32,7 +32,7 @@ _SUSPECT, _TIMES = (
     30.0,
 )  # squares of an IMU factor that make it one; and how many times those of the window before
 _BEFORE_S = 2.5  # what is known before a window may be wrong already
-_PRICE, _CLEARLY = 1.0, 10.0  # log-likelihood: of each IMU factor that is left out, and of leaving out any
+_PRICE, _CLEARLY = 1.0, 30.0  # log-likelihood: of each IMU factor that is left out, and of leaving out any
 _WORSE = 6.0  # log-likelihood by which a shorter span may be less probable
 GROWS = 4.0  # times the square of the first residual in a row
 _IN_A_ROW = 3  # measurements of a sensor that disagree make it one that denies
