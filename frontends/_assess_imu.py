@@ -142,7 +142,7 @@ def _mount_yaw(imu: TopicData, accel: Array, gyro: Array, motions: Sequence[Meas
         return 0.0, f"{said}: taken as 0"
     quarter = 90.0 * round(found.yaw_deg / 90.0)
     askew = abs(found.yaw_deg - quarter) > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
-    yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter))))
+    yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter)))) + 0.0
     said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"
     off_deg = abs(found.yaw_deg - quarter)
     if not askew and off_deg > max(_SLIGHTLY_DEG, 4.0 * found.sigma_deg):

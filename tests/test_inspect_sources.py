@@ -568,6 +568,30 @@ def test_a_course_that_wanders_about_the_heading_tells_no_compass_to_a_degree(
     assert ("its offset to the GNSS course wanders" in text) == bool(leeway_deg)
 
 
+def test_a_craft_that_goes_astern_for_a_while_has_no_worse_compass(tmp_path: Path) -> None:
+    """Half a minute astern of four was an offset that wanders by 69 deg: so much was drafted for the compass, which then told nothing."""
+    make, items = Messages(2), []
+    rng, rate_hz = np.random.default_rng(1), 20
+    t = np.arange(0.0, 180.0, 1.0 / rate_hz)
+    rate = 0.06 * np.sign(np.sin(2.0 * np.pi * t / 40.0))
+    yaw = np.cumsum(rate) / rate_hz
+    speed = np.where((t > 120.0) & (t < 150.0), -1.5, 1.5)
+    way = np.cumsum(speed * np.exp(1j * yaw)) / rate_hz
+    accel = np.gradient(speed, t) + 1j * speed * rate
+    lla = DATUM.geodetic_from_enu(np.column_stack([way.real, way.imag, 0.0 * t]))
+    for k in range(len(t)):
+        at = START_NS + k * S // rate_hz
+        felt, turns = (accel[k].real, accel[k].imag, G), (0.0, 0.0, rate[k])
+        items.append(("/imu", at, make.imu(at, rng.normal(felt, 0.01), rng.normal(turns, 1e-3))))
+        if k % 5 == 0:
+            items.append(("/compass", at, make.compass(at, (0.0, 0.0, np.sin(0.5 * yaw[k]), np.cos(0.5 * yaw[k])))))
+            items.append(("/fix", at, make.fix(at, *lla[k])))
+    _, config, _ = look(tmp_path, items, make)
+    compass = config.sensors["compass"]
+    assert isinstance(compass, CompassConfig)
+    assert compass.mount_offset_sigma_deg < 5.0
+
+
 @pytest.mark.parametrize("turns", [True, False])
 def test_a_compass_of_a_vessel_that_goes_sideways_is_one_if_it_turns_as_the_gyro_does(
     turns: bool, tmp_path: Path
