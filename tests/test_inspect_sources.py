@@ -72,6 +72,24 @@ def test_a_second_in_which_a_rolling_vessel_turns_back_is_no_standstill(tmp_path
     assert found.imus[0].gyro_bias_radps is None
 
 
+def test_the_second_between_ahead_and_astern_is_no_standstill(tmp_path: Path) -> None:
+    """Of two quiet seconds and more the part without speed was left, and what she turned in it was the gyroscope's bias."""
+    make, items = Messages(2), []
+    t = np.arange(0.0, 60.0, 0.02)
+    speed, yaw = 3.03 - 0.1 * t, 0.01 * t
+    way = np.cumsum(speed * np.exp(1j * yaw)) * 0.02
+    lla = DATUM.geodetic_from_enu(np.column_stack([way.real, way.imag, 0.0 * t]))
+    for k in range(len(t)):
+        at = START_NS + k * S // 50
+        items.append(("/imu", at, make.imu(at, (-0.1, speed[k] * 0.01, G), (0.001 * (k % 3), 0.0, 0.01))))
+        if k % 10 == 0:
+            items.append(("/fix", at, make.fix(at, *lla[k])))
+            items.append(("/wheel/odom", at, make.odometry(at, v=(speed[k], 0, 0))))
+    found, _, _ = look(tmp_path, items, make)
+    assert found.imus[0].still_s == 0.0
+    assert found.imus[0].gyro_bias_radps is None
+
+
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 180.0, -90.0])
 def test_fixes_of_a_slow_craft_in_waves_tell_the_yaw_of_its_imu(yaw_deg: float, tmp_path: Path) -> None:
     found, _, _ = look(tmp_path, boat(Messages(2), yaw_deg), Messages(2))
