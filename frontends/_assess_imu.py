@@ -93,7 +93,14 @@ def _measured_mount(imu: TopicData, accel: Array, gyro: Array, motions: Sequence
     said = (
         f"gravity is on {name} of the sensor" if aligned else f"gravity is {np.round(axis, 2).tolist()} in the sensor"
     )
-    return _turned(imu, accel, gyro, motions, level, said)
+    off_deg = float(np.degrees(np.arccos(np.clip(axis @ snapped, -1.0, 1.0))))
+    if not aligned or off_deg < _SLIGHTLY_DEG:
+        return _turned(imu, accel, gyro, motions, level, said)
+    mount = _turned(imu, accel, gyro, motions, level, f"{said}, {off_deg:.0f} deg off")
+    turn = Rotation.from_euler("xyz", mount.rpy_deg, degrees=True).as_matrix() @ level.T
+    roll, pitch, yaw = np.degrees(rpy_from_rotation(turn @ _level(axis))).tolist()
+    square = f"drafted square: where the sensor sits askew, and not the craft, set [{roll:.1f}, {pitch:.1f}, {yaw:.1f}]"
+    return replace(mount, evidence=f"{mount.evidence}; {square}")
 
 
 def _tilt_deg(R_body_imu: Array, accel: Array) -> float:

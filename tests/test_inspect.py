@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
+from scipy.spatial.transform import Rotation
 
 from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, ImuConfig, VesselConfig, load_config
 from graphloc.frames import Array, Datum, Geodetic
@@ -112,6 +113,16 @@ def test_mount_from_gravity_and_motion(tmp_path: Path, yaw_deg: float, upright: 
     np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, R, atol=1e-6)
     axis = 2 if upright else 1
     assert found.imus[0].gravity_axis[axis] == pytest.approx(1.0, abs=0.01)
+
+
+def test_an_imu_that_gravity_says_sits_askew_is_drafted_square_and_said_to_be(tmp_path: Path) -> None:
+    """Nothing told of 6 deg, by which an antenna 8 m up is 0.8 m off."""
+    R = Rotation.from_euler("xyz", [5.0, -3.0, 0.0], degrees=True).as_matrix()
+    _, config, text = look(tmp_path, drive(Messages(2), R), Messages(2))
+    assert config.sensors["imu"].mount.rpy_deg == (0.0, 0.0, 0.0)
+    assert "+z of the sensor, 6 deg off" in text
+    said = json.loads(text[text.index("set [") + 4 :].partition("]")[0] + "]")
+    assert said == pytest.approx((5.0, -3.0, 0.0), abs=0.3)
 
 
 def test_a_whole_draft(tmp_path: Path) -> None:
