@@ -167,9 +167,10 @@ def clock_jumps(stamps_ns: Stamps, logs_ns: Stamps) -> NDArray[np.bool_]:
 
 
 def steady_logs(stamps_ns: Stamps, logs_ns: Stamps) -> Stamps:
-    """Return recording times (N,) as if the recorder's clock had not been set: what they leap ahead while the stamps go on is taken off.
+    """Return recording times (N,) as if the recorder's clock had not been set, as it was where they leap while the stamps go on.
 
-    Only where more stamps then are near the usual latency: after a stall, messages come late, and later ones are not.
+    It is taken to be right at the end. Only where more stamps then are near the usual latency: after a stall, messages are late for a
+    while.
     """
     limit_ns, latency_ns = duration_ns(JUMP_LIMIT_S), logs_ns - stamps_ns
     unusual = int(_unusual(latency_ns).sum())
@@ -177,7 +178,7 @@ def steady_logs(stamps_ns: Stamps, logs_ns: Stamps) -> Stamps:
         return logs_ns
     by_ns, own_ns = np.diff(latency_ns), np.diff(stamps_ns)
     by_ns[(np.abs(by_ns) < limit_ns) | (own_ns < -duration_ns(_SET_BACK_S)) | (own_ns > limit_ns)] = 0
-    steady_ns = logs_ns - np.concatenate([[0], np.cumsum(by_ns)])
+    steady_ns = logs_ns + by_ns.sum() - np.concatenate([[0], np.cumsum(by_ns)])
     return steady_ns if int(_unusual(steady_ns - stamps_ns).sum()) < unusual else logs_ns
 
 

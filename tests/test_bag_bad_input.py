@@ -495,7 +495,11 @@ def test_a_recorder_whose_clock_is_set_loses_nothing(share: float, tmp_path: Pat
     stamps_ns = np.arange(0, 400 * S, S)
     stalled_ns = np.where((stamps_ns > 100 * S) & (stamps_ns < 200 * S), 200 * S, stamps_ns)
     assert steady_logs(stamps_ns, stalled_ns) is stalled_ns
-    assert inspect_bag(tmp_path / "run").gnss[0].fixes == 20
+    found = inspect_bag(tmp_path / "run")
+    assert found.gnss[0].fixes == 20
+    assert sum("the recorder's clock was set by +3600 s" in w for w in found.warnings) == 1
+    assert [abs(t.latency_s[0]) < 0.1 for t in found.topics if t.latency_s] == [True, True]
+    assert "time_offset_s" not in draft_config(found)
 
 
 def test_a_sensor_in_another_epoch_is_reported_and_not_fixed(tmp_path: Path) -> None:
