@@ -42,6 +42,7 @@ _FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps th
 _AT_ONCE, _AFTER_GAP = 0.1, 1.3  # usual steps: within a burst at most, at a gap at least
 _BURSTS = 0.3  # share of samples in bursts, from which they are laid out
 _HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing, as online
+_BEFORE_S = 1.0  # at most, of samples that come after the run's first one and were measured before it
 _IN_ORDER = 0.8  # of those that follow, at the least: others come late
 
 
@@ -268,7 +269,9 @@ def in_order_or_late(stamps_ns: Stamps) -> NDArray[np.bool_]:
     taken_ns = 0
     for i, n in zip(late.tolist(), np.searchsorted(kept, stamps_ns[late]).tolist(), strict=True):
         stamp_ns = int(stamps_ns[i])
-        if 0 < n < len(kept) and min(stamp_ns - max(kept[n - 1], taken_ns), kept[n] - stamp_ns) >= hole_ns:
+        # Before the first one in order only what belongs to the run.
+        before_ns = int(kept[n - 1]) if n else int(kept[0]) - duration_ns(_BEFORE_S)
+        if n < len(kept) and min(stamp_ns - max(before_ns, taken_ns), kept[n] - stamp_ns) >= hole_ns:
             keep[i], taken_ns = True, stamp_ns
     return keep
 

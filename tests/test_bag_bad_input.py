@@ -421,6 +421,19 @@ def test_imu_samples_that_come_late_are_sorted_in(tmp_path: Path) -> None:
     assert sorted(r.stamp_ns for r in rows_of(recording, "imu")) == [twice, between]
 
 
+def test_samples_that_come_after_later_ones_at_the_very_start_are_sorted_in(tmp_path: Path) -> None:
+    """They were rejected, and the fix at their time with them."""
+    items = still_run(MAKE)
+    first = [i for i, (topic, _, _) in enumerate(items) if topic == "/imu"][:2]
+    for i in first:
+        items[i] = (items[i][0], items[i][1] + S // 10, items[i][2])
+    items.append(("/imu", START_NS + S, MAKE.imu(START_NS - 5 * S)))  # of before the run
+    recording = read(tmp_path, items)
+    assert recording.imu is not None
+    assert (len(recording.imu), len(recording.measurements)) == (200, 20)
+    assert int(recording.imu.stamps_ns[0]) == START_NS
+
+
 def test_one_stamp_that_ran_ahead_costs_one_sample(tmp_path: Path) -> None:
     """Keeping each sample that is later than the last kept one would lose three seconds here."""
     items = still_run(MAKE)
