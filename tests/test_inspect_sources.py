@@ -600,7 +600,7 @@ def test_a_craft_that_goes_astern_for_a_while_has_no_worse_compass(tmp_path: Pat
     for k in range(len(t)):
         at = START_NS + k * S // rate_hz
         felt, turns = (accel[k].real, accel[k].imag, G), (0.0, 0.0, rate[k])
-        items.append(("/imu", at, make.imu(at, rng.normal(felt, 0.01), rng.normal(turns, 1e-3))))
+        items.append(("/imu", at, make.imu(at, rng.normal(felt, 0.01).tolist(), rng.normal(turns, 1e-3).tolist())))
         if k % 5 == 0:
             items.append(("/compass", at, make.compass(at, (0.0, 0.0, np.sin(0.5 * yaw[k]), np.cos(0.5 * yaw[k])))))
             items.append(("/fix", at, make.fix(at, *lla[k])))
