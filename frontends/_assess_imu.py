@@ -147,10 +147,14 @@ def _mount_yaw(imu: TopicData, accel: Array, gyro: Array, motions: Sequence[Meas
     found = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], accel, gyro, motions)
     if found is None:
         return 0.0, "too little motion to find its yaw from: taken as 0"
+    quarter = 90.0 * round(found.yaw_deg / 90.0)
+    if not found.clear and found.likely:
+        yaw = float(np.degrees(wrap_angle(np.radians(quarter)))) + 0.0
+        said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg, but not clearly (coherence {found.coherence:.2f})"
+        return yaw, f"{said}: taken as {yaw:.0f}"
     if not found.clear:
         said = f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
         return 0.0, f"{said}: taken as 0"
-    quarter = 90.0 * round(found.yaw_deg / 90.0)
     askew = abs(found.yaw_deg - quarter) > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
     yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter)))) + 0.0
     said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"

@@ -98,6 +98,18 @@ def test_fixes_of_a_slow_craft_in_waves_tell_the_yaw_of_its_imu(yaw_deg: float, 
     assert abs((mount.rpy_deg[2] - yaw_deg + 180.0) % 360.0 - 180.0) < 0.5
 
 
+@pytest.mark.parametrize(("seconds", "yaw_deg"), [(60, 0.0), (90, 90.0), (200, 90.0)])
+def test_a_yaw_that_is_likely_but_not_clear_is_drafted_by_the_quarter_turn(
+    seconds: int, yaw_deg: float, tmp_path: Path
+) -> None:
+    """Of runs of a minute or so 0 was drafted, and the heading was 90 deg off beside a compass that was right."""
+    items = [item for item in boat(Messages(2), 90.0) if item[1] < START_NS + seconds * S]
+    found, _, _ = look(tmp_path, items, Messages(2))
+    mount = found.imus[0].mount
+    assert mount.rpy_deg[2] == yaw_deg
+    assert ("not clearly" in mount.evidence) == (seconds == 90)
+
+
 def test_an_imu_that_sits_askew_is_not_taken_for_straight(tmp_path: Path) -> None:
     """It was snapped to a quarter turn, and 40 deg were lost."""
     found, _, _ = look(tmp_path, drive(Messages(2), rotation_z(40.0)), Messages(2))
