@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 
@@ -12,6 +13,16 @@ from graphloc.errors import ConfigError
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition
 from graphloc.recording import Recording
+
+_MOST_GAPS, _GAP_S, _FEWEST_FIXES = 8, 10, 10
+
+
+def suggested(fixes: Sequence[GnssPosition]) -> str | None:
+    """Return what --hold-out tests a run of these fixes by: gaps with as much between them; None of too few fixes for either form."""
+    if len(fixes) < _FEWEST_FIXES:
+        return None
+    gaps = int(((fixes[-1].stamp_ns - fixes[0].stamp_ns) * 1e-9 / _GAP_S - 1.0) / 2.0)
+    return f"gaps:{min(gaps, _MOST_GAPS)}x{_GAP_S}" if gaps > 0 else "every:5"
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,7 +66,9 @@ def topic_report(stream: TopicData, count: int) -> TopicReport:
     if len(stamps) == 0:
         return TopicReport(**base, undecodable=stream.undecodable, no_stamp=stream.no_stamp)  # type: ignore[arg-type]
     steps = np.diff(stamps)
-    ahead = steps[steps > 0] / NS_PER_S
+    # Messages that come out of order leave no gap, and the rate is not that of those in order.
+    ahead = np.diff(stamps if _clock.set_backs(stamps) else np.sort(stamps))
+    ahead = ahead[ahead > 0] / NS_PER_S
     usual = float(np.median(ahead)) if len(ahead) else None
     latency = np.percentile(logs - stamps, [5, 50, 95]) / NS_PER_S
     return TopicReport(

@@ -80,7 +80,9 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
         convention=fit.convention,
         offset_deg=None if sideways else fit.offset_deg,
         scatter_deg=fit.scatter_deg,
-        leeway_deg=None if sideways else _wanders_deg(courses.stamps_ns, fit.apart_rad),
+        leeway_deg=None
+        if sideways
+        else _wanders_deg(courses.stamps_ns, _ahead(fit.apart_rad, np.radians(fit.offset_deg))),
         samples=len(fit.apart_rad),
         why=_why(fit, by_gyro, told=told is not None, fits_course=fits_course, sideways=sideways),
     )
@@ -210,6 +212,11 @@ def _middle_deg(angle: Array) -> tuple[float, float]:
     middle = mean + float(np.median(wrap_angle(angle - mean)))
     scatter = float(robust_sigma(wrap_angle(angle - middle)))
     return float(np.degrees(wrap_angle(middle))), float(np.degrees(scatter))
+
+
+def _ahead(apart: Array, usual: float) -> Array:
+    """Return headings minus courses (N,), rad, as if the craft went ahead where it goes astern: there it is over 90 deg off `usual`."""
+    return usual + wrap_angle(2.0 * (apart - usual)) / 2.0
 
 
 def _wanders_deg(stamps_ns: NDArray[np.int64], angle: Array) -> float | None:

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
-from graphloc.frontends._assess import Courses, MeasuredMotion, sane, vec
+from graphloc.frontends import _clock
+from graphloc.frontends._assess import Courses, MeasuredMotion, vec
 from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
 from graphloc.frontends._reports import ImuReport, MountGuess
 from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, turns_gravity, without_gravity
@@ -30,7 +31,10 @@ from graphloc.white_noise import white_noise
 # Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
 _COURSE_S, _COURSE_CLEAR = 12.0, 0.6
 _UPSIDE_DOWN_DEG = 150.0
-_QUIET_S = 2
+_QUIET_S, _STANDS_S = (
+    2,
+    1.5,
+)  # quiet seconds in a row; for how long it is slow, at most, that only changes its direction
 # Off body z, from which gravity is said to be; about a quarter turn, by which it, or the motion, overrules tf, and how coherent.
 _TILTED_DEG, _QUARTER_DEG, _OVERRULES = 20.0, 20.0, 0.6
 _SLIGHTLY_DEG = 3.0  # off a quarter turn, from which it is said
@@ -39,7 +43,9 @@ _ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, o
 
 def samples_of(imu: TopicData) -> tuple[NDArray[np.intp], list[str]]:
     """Return the indices of usable samples, sorted by stamp, and warnings on frozen ones, which are dropped."""
-    keep = sane(imu)
+    good = np.flatnonzero(~_clock.clock_jumps(imu.stamps_ns, imu.logs_ns))
+    keep = good[_clock.in_order_or_late(imu.stamps_ns[good])]
+    keep = keep[np.argsort(imu.stamps_ns[keep], kind="stable")]
     bad = frozen_samples(imu.stamps_ns[keep], imu.rows[keep, :6] if len(keep) else np.zeros((0, 6)))
     return keep[~bad], frozen_imu_warning(imu.topic, imu.stamps_ns[keep], bad)
 
@@ -90,7 +96,14 @@ def _measured_mount(imu: TopicData, accel: Array, gyro: Array, motions: Sequence
     said = (
         f"gravity is on {name} of the sensor" if aligned else f"gravity is {np.round(axis, 2).tolist()} in the sensor"
     )
-    return _turned(imu, accel, gyro, motions, level, said)
+    off_deg = float(np.degrees(np.arccos(np.clip(axis @ snapped, -1.0, 1.0))))
+    if not aligned or off_deg < _SLIGHTLY_DEG:
+        return _turned(imu, accel, gyro, motions, level, said)
+    mount = _turned(imu, accel, gyro, motions, level, f"{said}, {off_deg:.0f} deg off")
+    turn = Rotation.from_euler("xyz", mount.rpy_deg, degrees=True).as_matrix() @ level.T
+    roll, pitch, yaw = np.degrees(rpy_from_rotation(turn @ _level(axis))).tolist()
+    square = f"drafted square: where the sensor sits askew, and not the craft, set [{roll:.1f}, {pitch:.1f}, {yaw:.1f}]"
+    return replace(mount, evidence=f"{mount.evidence}; {square}")
 
 
 def _tilt_deg(R_body_imu: Array, accel: Array) -> float:
@@ -137,12 +150,16 @@ def _mount_yaw(imu: TopicData, accel: Array, gyro: Array, motions: Sequence[Meas
     found = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], accel, gyro, motions)
     if found is None:
         return 0.0, "too little motion to find its yaw from: taken as 0"
+    quarter = 90.0 * round(found.yaw_deg / 90.0)
+    if not found.clear and found.likely:
+        yaw = float(np.degrees(wrap_angle(np.radians(quarter)))) + 0.0
+        said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg, but not clearly (coherence {found.coherence:.2f})"
+        return yaw, f"{said}: taken as {yaw:.0f}"
     if not found.clear:
         said = f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
         return 0.0, f"{said}: taken as 0"
-    quarter = 90.0 * round(found.yaw_deg / 90.0)
     askew = abs(found.yaw_deg - quarter) > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
-    yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter))))
+    yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter)))) + 0.0
     said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"
     off_deg = abs(found.yaw_deg - quarter)
     if not askew and off_deg > max(_SLIGHTLY_DEG, 4.0 * found.sigma_deg):
@@ -328,18 +345,22 @@ def _standstill(
 ) -> NDArray[np.bool_]:
     """Return (N,) whether a sample is in several quiet seconds in a row, at a speed of zero if that is known.
 
-    A rolling vessel is quiet for a second at each end of its motion, and its rate then is not a bias.
+    A rolling vessel is quiet for a second at each end of its motion, and one that goes astern has no speed for a moment: its rate then
+    is not a bias.
     """
     second = (stamps - stamps[0]) // NS_PER_S
     quiet = np.zeros(int(second[-1]) + 1, dtype=bool)
+    moves = np.zeros(len(stamps), dtype=bool)
+    if motion is not None:
+        speed = np.interp((stamps - motion.origin_ns) / NS_PER_S, motion.t_s, motion.speed_mps)
+        moves = np.abs(speed) > 0.05
+        for first, after in runs(~moves):
+            turns_back = 0 < first and after < len(speed) and speed[first - 1] * speed[after] < 0.0
+            moves[first:after] = turns_back and stamps[after] - stamps[first - 1] < _STANDS_S * NS_PER_S
     for s in np.unique(second):
         part = second == s
         calm = float(gyro[part].std(axis=0).max()) < 0.03 and float(accel[part].std(axis=0).max()) < 0.2
         quiet[s] = calm and float(np.abs(gyro[part].mean(axis=0)).max()) < 0.02
     for first, after in runs(quiet):
         quiet[first:after] &= after - first >= _QUIET_S
-    still: NDArray[np.bool_] = quiet[second]
-    if motion is not None:
-        t = (stamps - motion.origin_ns) / NS_PER_S
-        still[np.abs(np.interp(t, motion.t_s, motion.speed_mps)) > 0.05] = False
-    return still
+    return np.asarray(quiet[second] & ~moves)

@@ -85,9 +85,9 @@ def _axes_by(
         own = _east_or_ahead(chords, mean)
         if own is None:
             said = "the craft goes east or west throughout, where a speed ahead looks like a velocity to the east"
-            return EITHER, f"{said}: either differs by {errors[0]:.2f} m/s RMS from the GNSS track"
+            return EITHER, f"{said}: either differs by {errors[0]:.2f} m/s RMS from the GNSS track beyond its noise"
         best = _AXES.index(own)
-    why = f"differs from the GNSS track by {errors[best]:.2f} m/s RMS, {errors[0]:.2f} m/s as east, north, up"
+    why = f"differs from the GNSS track by {errors[best]:.2f} m/s RMS beyond the fixes' noise, {errors[0]:.2f} m/s as east, north, up"
     return (_AXES[best] if errors[best] < _FITS * speed else "unknown"), why
 
 

@@ -42,6 +42,7 @@ _FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps th
 _AT_ONCE, _AFTER_GAP = 0.1, 1.3  # usual steps: within a burst at most, at a gap at least
 _BURSTS = 0.3  # share of samples in bursts, from which they are laid out
 _HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing, as online
+_BEFORE_S = 1.0  # at most, of samples that come after the run's first one and were measured before it
 _IN_ORDER = 0.8  # of those that follow, at the least: others come late
 
 
@@ -102,6 +103,14 @@ class ClockStep(NamedTuple):
         said = f"the clock of {whose} was set {way} by {abs(self.by_s):.2f} s at {utc_text(self.at_ns)}, recording time"
         return f"{said}: no time_offset_s holds on both sides, and no bound includes it; take one side (--start, --duration)"
 
+    @property
+    def said_of_recorder(self) -> str:
+        """Return it in words, of the clock that makes the recording times."""
+        return (
+            f"the recorder's clock was set by {self.by_s:+.0f} s at {utc_text(self.at_ns)}, recording time, while the stamps of the headers "
+            "go on: these are right on both sides; messages without one are on one side only"
+        )
+
 
 def step(stamps_ns: Stamps, logs_ns: Stamps) -> ClockStep | None:
     """Return the one step in which a clock gains all that it gains on the recording times; None where it gains otherwise, or hardly."""
@@ -155,9 +164,38 @@ def behind_s(own: Clock, imu: Clock, reference: Clock) -> float:
 
 def clock_jumps(stamps_ns: Stamps, logs_ns: Stamps) -> NDArray[np.bool_]:
     """Return (N,) whether a stamp differs by more than `JUMP_LIMIT_S` from the usual latency of its topic."""
-    if len(stamps_ns) == 0:
+    return _unusual(steady_logs(stamps_ns, logs_ns) - stamps_ns)
+
+
+def steady_logs(stamps_ns: Stamps, logs_ns: Stamps) -> Stamps:
+    """Return recording times (N,) as if the recorder's clock had not been set, as it was where they leap while the stamps go on.
+
+    It is taken to be right at the end. Only where more stamps then are near the usual latency: after a stall, messages are late for a
+    while.
+    """
+    limit_ns, latency_ns = duration_ns(JUMP_LIMIT_S), logs_ns - stamps_ns
+    unusual = int(_unusual(latency_ns).sum())
+    if not unusual:
+        return logs_ns
+    by_ns, own_ns = np.diff(latency_ns), np.diff(stamps_ns)
+    by_ns[(np.abs(by_ns) < limit_ns) | (own_ns < -duration_ns(_SET_BACK_S)) | (own_ns > limit_ns)] = 0
+    steady_ns = logs_ns + by_ns.sum() - np.concatenate([[0], np.cumsum(by_ns)])
+    return steady_ns if int(_unusual(steady_ns - stamps_ns).sum()) < unusual else logs_ns
+
+
+def recorder_set(stamps_ns: Stamps, logs_ns: Stamps) -> ClockStep | None:
+    """Return the largest step by which the recorder's clock was set, as `steady_logs` finds it; None where it was not."""
+    off_ns = logs_ns - steady_logs(stamps_ns, logs_ns)
+    by_ns = np.diff(off_ns)
+    if not by_ns.any():
+        return None
+    k = int(np.argmax(np.abs(by_ns)))
+    return ClockStep(float(by_ns[k]) / NS_PER_S, int(logs_ns[k + 1]))
+
+
+def _unusual(latency_ns: Stamps) -> NDArray[np.bool_]:
+    if len(latency_ns) == 0:
         return np.zeros(0, dtype=bool)
-    latency_ns = logs_ns - stamps_ns
     return np.asarray(np.abs(latency_ns - np.int64(np.median(latency_ns))) > duration_ns(JUMP_LIMIT_S))
 
 
@@ -231,7 +269,9 @@ def in_order_or_late(stamps_ns: Stamps) -> NDArray[np.bool_]:
     taken_ns = 0
     for i, n in zip(late.tolist(), np.searchsorted(kept, stamps_ns[late]).tolist(), strict=True):
         stamp_ns = int(stamps_ns[i])
-        if 0 < n < len(kept) and min(stamp_ns - max(kept[n - 1], taken_ns), kept[n] - stamp_ns) >= hole_ns:
+        # Before the first one in order only what belongs to the run.
+        before_ns = int(kept[n - 1]) if n else int(kept[0]) - duration_ns(_BEFORE_S)
+        if n < len(kept) and min(stamp_ns - max(before_ns, taken_ns), kept[n] - stamp_ns) >= hole_ns:
             keep[i], taken_ns = True, stamp_ns
     return keep
 

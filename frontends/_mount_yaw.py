@@ -24,6 +24,7 @@ HALF_S = (0.5, 1.0, 2.0, 4.0)
 STEP_S = 0.5  # between two times at which it is asked
 FEWEST, MOVES_M = 20, 1.0  # windows; a shorter way has no direction
 _MIN_COHERENCE, _CLEAR = 0.25, 4.0  # and so many times what chance gives
+_LIKELY_COHERENCE, _LIKELY = 0.5, 3.0  # the same, to choose between quarter turns: chance gives it once in 8000
 _ASTRAY_DEG = 30.0  # leeway, or an antenna far ahead, make less
 
 
@@ -40,6 +41,11 @@ class YawInCraft:
     def clear(self) -> bool:
         """Whether chance would not have it."""
         return self.coherence >= max(_MIN_COHERENCE, _CLEAR * self.chance)
+
+    @property
+    def likely(self) -> bool:
+        """Whether it tells which quarter turn is the likeliest."""
+        return self.coherence >= max(_LIKELY_COHERENCE, _LIKELY * self.chance)
 
     @property
     def sigma_deg(self) -> float:

@@ -158,13 +158,16 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
     if len(told) < 2:
         return []
     reference = next((r for r in told if r.config.kind == "imu"), told[0])
-    gains = {r.sensor: _clock.gain(r.stamps(), r.logs()) for r in told}
-    usual, usual_s = gains[reference.sensor], _clock.usual_latency_s(reference.stamps(), reference.logs())
-    steps = {r.sensor: _clock.step(r.stamps(), r.logs()) for r in told}
+    logs = {r.sensor: _clock.steady_logs(r.stamps(), r.logs()) for r in told}
+    gains = {r.sensor: _clock.gain(r.stamps(), logs[r.sensor]) for r in told}
+    usual, usual_s = gains[reference.sensor], _clock.usual_latency_s(reference.stamps(), logs[reference.sensor])
+    steps = {r.sensor: _clock.step(r.stamps(), logs[r.sensor]) for r in told}
     stepped: dict[str, list[str]] = {}
     lines = []
+    if (recorder := _clock.recorder_set(reference.stamps(), reference.logs())) is not None:
+        lines.append(recorder.said_of_recorder)
     for r in told:
-        own, behind = gains[r.sensor], _clock.usual_latency_s(r.stamps(), r.logs()) - usual_s
+        own, behind = gains[r.sensor], _clock.usual_latency_s(r.stamps(), logs[r.sensor]) - usual_s
         gain_s, drift_ppm = own.gained_s - usual.gained_s, own.drift_ppm - usual.drift_ppm
         whose = r.sensor if steps[r.sensor] else reference.sensor
         if abs(gain_s) > _clock.GAIN_LIMIT_S and (step := steps[whose]) is not None:

@@ -249,6 +249,10 @@ class TopicData:
         """Return the stream with `by_ns` added to its stamps."""
         return replace(self, _stamps=[stamp_ns + by_ns for stamp_ns in self._stamps])
 
+    def logged(self, logs_ns: NDArray[np.int64]) -> TopicData:
+        """Return the stream with other recording times (N,)."""
+        return replace(self, _logs=logs_ns.tolist())
+
     def stamped(self, stamps_ns: NDArray[np.int64]) -> TopicData:
         """Return the stream with other stamps (N,)."""
         return replace(self, _stamps=stamps_ns.tolist())

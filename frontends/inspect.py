@@ -36,7 +36,15 @@ from graphloc.frontends._assess_receivers import apart_m, apart_warning, height_
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_wander import changes, way_of
 from graphloc.frontends._assess_world import in_map_grid, world_of
-from graphloc.frontends._clock import FEWEST_STAMPS, GAIN_LIMIT_S, refuse_woven, step, usual_latency_s
+from graphloc.frontends._clock import (
+    FEWEST_STAMPS,
+    GAIN_LIMIT_S,
+    recorder_set,
+    refuse_woven,
+    steady_logs,
+    step,
+    usual_latency_s,
+)
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
 from graphloc.frontends._reports import (
@@ -242,6 +250,10 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
             bag, [t.topic for t in topics.values() if INFO in t.msgtypes and t.messages] if cameras else []
         )
         source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
+    recorder = next((at for s in streams if (at := recorder_set(s.stamps_ns, s.logs_ns))), None)
+    if recorder is not None:
+        warnings += (recorder.said_of_recorder,)
+        streams = [s.logged(steady_logs(s.stamps_ns, s.logs_ns)) for s in streams]
     streams = [evenly(s) if s.msgtype == IMU and len(s) else s for s in without_drift(streams)]
     for stream in streams:
         if stream.msgtype == IMU:

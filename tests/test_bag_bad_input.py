@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Writer
 from scipy.spatial.transform import Rotation
 
 from graphloc.errors import InputError
-from graphloc.frontends._clock import longest_increasing
+from graphloc.frontends._clock import longest_increasing, steady_logs
 from graphloc.frontends._sanity import turns_gravity
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag
@@ -421,6 +421,19 @@ def test_imu_samples_that_come_late_are_sorted_in(tmp_path: Path) -> None:
     assert sorted(r.stamp_ns for r in rows_of(recording, "imu")) == [twice, between]
 
 
+def test_samples_that_come_after_later_ones_at_the_very_start_are_sorted_in(tmp_path: Path) -> None:
+    """They were rejected, and the fix at their time with them."""
+    items = still_run(MAKE)
+    first = [i for i, (topic, _, _) in enumerate(items) if topic == "/imu"][:2]
+    for i in first:
+        items[i] = (items[i][0], items[i][1] + S // 10, items[i][2])
+    items.append(("/imu", START_NS + S, MAKE.imu(START_NS - 5 * S)))  # of before the run
+    recording = read(tmp_path, items)
+    assert recording.imu is not None
+    assert (len(recording.imu), len(recording.measurements)) == (200, 20)
+    assert int(recording.imu.stamps_ns[0]) == START_NS
+
+
 def test_one_stamp_that_ran_ahead_costs_one_sample(tmp_path: Path) -> None:
     """Keeping each sample that is later than the last kept one would lose three seconds here."""
     items = still_run(MAKE)
@@ -477,6 +490,29 @@ def test_the_computer_clock_is_set_during_the_run(tmp_path: Path) -> None:
     assert len(rows_of(recording, "imu")) == 100
     assert all("busiest part" in r.reason for r in recording.rows)
     assert any("imu: 100 messages rejected" in w for w in recording.warnings)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5])
+def test_a_recorder_whose_clock_is_set_loses_nothing(share: float, tmp_path: Path) -> None:
+    """Stamps of the lesser part were 'clock jumps'; of two equal parts, all were. What is late for a while, and one wrong stamp, are not."""
+    items = [(topic, at - (3600 * S if at < START_NS + share * 4 * S else 0), m) for topic, at, m in still_run(MAKE)]
+    items.append(("/imu", START_NS + 3 * S + 1, MAKE.imu(START_NS + 3 * S + 500 * S)))
+    recording = read(tmp_path, items)
+    assert recording.imu is not None
+    assert (len(recording.imu), len(recording.measurements)) == (200, 20)
+    assert [r.reason.partition(":")[0] for r in rows_of(recording, "imu")] == ["clock jump"]
+    assert [w.partition(" at ")[0] for w in recording.warnings if "recorder" in w] == [
+        "the recorder's clock was set by +3600 s"
+    ]
+    assert not any("time_offset_s" in w for w in recording.warnings)
+    stamps_ns = np.arange(0, 400 * S, S)
+    stalled_ns = np.where((stamps_ns > 100 * S) & (stamps_ns < 200 * S), 200 * S, stamps_ns)
+    assert steady_logs(stamps_ns, stalled_ns) is stalled_ns
+    found = inspect_bag(tmp_path / "run")
+    assert found.gnss[0].fixes == 20
+    assert sum("the recorder's clock was set by +3600 s" in w for w in found.warnings) == 1
+    assert [abs(t.latency_s[0]) < 0.1 for t in found.topics if t.latency_s] == [True, True]
+    assert "time_offset_s" not in draft_config(found)
 
 
 def test_a_sensor_in_another_epoch_is_reported_and_not_fixed(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from graphloc import app
 from graphloc.config import BodyVelocityConfig, ImuConfig, VelocityConfig, VesselConfig
-from graphloc.eval.calibrate import PROBE, Calibration, Check, Suggestion, _check
+from graphloc.eval.calibrate import PROBE, Calibration, Check, Suggestion, _check, _suggestion
 from graphloc.eval.calibrate._evidence import Evidence, OffsetEstimate
 from graphloc.eval.calibrate._imu import imu_noise
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
@@ -336,6 +336,15 @@ def test_it_is_written_and_shown(right: app.Run, tmp_path: Path) -> None:
     told = json.loads((tmp_path / "run/calibration.json").read_text(encoding="utf-8"))
     assert told["suggestions"][0]["suggested"] == 1.5
     assert told["checks"][0]["sigma"] == 0.02
+
+
+def test_a_turned_heading_may_be_a_turned_imu(right: app.Run) -> None:
+    """An IMU 12 deg askew was said to be a compass of -11 deg: set so, the heading stayed wrong, and nothing told any more."""
+    found = OffsetEstimate(value=float(np.radians(-10.8)), sigma=0.017, drop=100.0)
+    said = _suggestion(("compass", "yaw"), found, {}, right.recording, right.config)
+    assert said.suggested == pytest.approx(-10.8)
+    assert said.action == "measure it, then set it; or sensors.imu.mount.rpy_deg[2] is off, the other way"
+    assert "imu" not in _suggestion(("gnss", "x"), found, {}, right.recording, right.config).action
 
 
 def test_an_offset_of_three_and_a_half_sigmas_does_not_fit(right: app.Run) -> None:

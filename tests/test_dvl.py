@@ -122,6 +122,7 @@ def test_it_is_drafted_with_its_z_down(msgtype: str, tmp_path: Path) -> None:
     assert (log.topic, log.through, log.axes, log.enabled) == ("/dvl", "ground", ("x", "y", "z"), False)
     assert log.mount.rpy_deg == (180.0, 0.0, 0.0)
     assert "a Doppler log's, by its type; differs from the GNSS track by 0.0" in text
+    assert "m/s RMS beyond the fixes' noise" in text
     assert [t.msgtype for t in found.topics if t.topic == "/dvl"] == [msgtype]
     sensors = {name: s.model_copy(update={"enabled": True}) for name, s in config.sensors.items() if s.kind in ("imu", "body_velocity")}  # fmt: skip
     recording = read_recording(tmp_path / "run", config.model_copy(update={"sensors": sensors}))

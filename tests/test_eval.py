@@ -14,7 +14,7 @@ from graphloc.blocks import MountConfig
 from graphloc.config import VelocityConfig, VesselConfig
 from graphloc.errors import ConfigError
 from graphloc.eval import ekf, metrics
-from graphloc.eval.holdout import HoldOut
+from graphloc.eval.holdout import HoldOut, suggested
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.eval.simulate._voyage import open_motion
 from graphloc.frames import Datum, Geodetic
@@ -127,6 +127,17 @@ def test_every_nth_is_the_nth() -> None:
     fixes = [m.seq for m in run.recording.of(GnssPosition)]
     _, held = HoldOut.parse("every:4").split(run.recording)
     assert [m.seq for m in held] == fixes[3::4]
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "said"), [(200.0, "gaps:8x10"), (60.0, "gaps:2x10"), (20.0, "every:5"), (0.5, None)]
+)
+def test_the_hold_out_that_is_suggested_fits_the_run(duration_s: float, said: str | None) -> None:
+    """Every run was told to hold out eight gaps of 10 s, which one of a minute and a half then refused."""
+    run = simulate(Scenario(duration_s=duration_s, imu_hz=10.0, noise="clean", pose_hz=0.0), 0)
+    assert suggested(run.recording.of(GnssPosition)) == said
+    if said:
+        assert HoldOut.parse(said).split(run.recording)[1]
 
 
 def test_hold_out_that_holds_nothing_is_refused() -> None:

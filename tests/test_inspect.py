@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
+from scipy.spatial.transform import Rotation
 
 from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, ImuConfig, VesselConfig, load_config
 from graphloc.frames import Array, Datum, Geodetic
@@ -112,6 +113,16 @@ def test_mount_from_gravity_and_motion(tmp_path: Path, yaw_deg: float, upright: 
     np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, R, atol=1e-6)
     axis = 2 if upright else 1
     assert found.imus[0].gravity_axis[axis] == pytest.approx(1.0, abs=0.01)
+
+
+def test_an_imu_that_gravity_says_sits_askew_is_drafted_square_and_said_to_be(tmp_path: Path) -> None:
+    """Nothing told of 6 deg, by which an antenna 8 m up is 0.8 m off."""
+    R = Rotation.from_euler("xyz", [5.0, -3.0, 0.0], degrees=True).as_matrix()
+    _, config, text = look(tmp_path, drive(Messages(2), R), Messages(2))
+    assert config.sensors["imu"].mount.rpy_deg == (0.0, 0.0, 0.0)
+    assert "+z of the sensor, 6 deg off" in text
+    said = json.loads(text[text.index("set [") + 4 :].partition("]")[0] + "]")
+    assert said == pytest.approx((5.0, -3.0, 0.0), abs=0.3)
 
 
 def test_a_whole_draft(tmp_path: Path) -> None:
@@ -288,6 +299,22 @@ def test_stamps_gaps_and_latency(tmp_path: Path) -> None:
     assert imu.latency_s[1] == pytest.approx(0.030)
     camera = next(t for t in found.topics if t.topic == "/camera")
     assert (camera.count, camera.rate_hz) == (1, None)
+
+
+def test_an_imu_whose_samples_come_out_of_order_is_assessed_in_order(tmp_path: Path) -> None:
+    """It had a fifth of its rate, gaps, and half as much noise again: what came late was left out, as if smooth did so."""
+    make, rng = Messages(2), np.random.default_rng(2)
+    items = drive(make, seconds=20)
+    mixed = [(topic, at + (int(rng.integers(S // 5)) if topic == "/imu" else 0), m) for topic, at, m in items]
+    inspected = [
+        look(tmp_path / name, sorted(own, key=lambda item: item[1]), make)[0]
+        for name, own in (("in order", items), ("mixed", mixed))
+    ]
+    whole, imu = (next(t for t in found.topics if t.topic == "/imu") for found in inspected)
+    assert (imu.backward or 0) > 300
+    assert (imu.gaps, imu.rate_hz, imu.max_gap_s) == (0, whole.rate_hz, whole.max_gap_s)
+    assert inspected[1].imus[0].accel_noise_ug == pytest.approx(inspected[0].imus[0].accel_noise_ug, rel=0.02)
+    assert inspected[1].imus[0].still_s == pytest.approx(inspected[0].imus[0].still_s, abs=0.1)
 
 
 def test_the_place_of_a_vessel_that_lies_still_is_no_mount(tmp_path: Path) -> None:

@@ -72,12 +72,42 @@ def test_a_second_in_which_a_rolling_vessel_turns_back_is_no_standstill(tmp_path
     assert found.imus[0].gyro_bias_radps is None
 
 
+def test_the_second_between_ahead_and_astern_is_no_standstill(tmp_path: Path) -> None:
+    """Of two quiet seconds and more the part without speed was left, and what she turned in it was the gyroscope's bias."""
+    make, items = Messages(2), []
+    t = np.arange(0.0, 60.0, 0.02)
+    speed, yaw = 3.03 - 0.1 * t, 0.01 * t
+    way = np.cumsum(speed * np.exp(1j * yaw)) * 0.02
+    lla = DATUM.geodetic_from_enu(np.column_stack([way.real, way.imag, 0.0 * t]))
+    for k in range(len(t)):
+        at = START_NS + k * S // 50
+        items.append(("/imu", at, make.imu(at, (-0.1, speed[k] * 0.01, G), (0.001 * (k % 3), 0.0, 0.01))))
+        if k % 10 == 0:
+            items.append(("/fix", at, make.fix(at, *lla[k])))
+            items.append(("/wheel/odom", at, make.odometry(at, v=(speed[k], 0, 0))))
+    found, _, _ = look(tmp_path, items, make)
+    assert found.imus[0].still_s == 0.0
+    assert found.imus[0].gyro_bias_radps is None
+
+
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 180.0, -90.0])
 def test_fixes_of_a_slow_craft_in_waves_tell_the_yaw_of_its_imu(yaw_deg: float, tmp_path: Path) -> None:
     found, _, _ = look(tmp_path, boat(Messages(2), yaw_deg), Messages(2))
     mount = found.imus[0].mount
     assert "yaw by the motion of /fix" in mount.evidence
     assert abs((mount.rpy_deg[2] - yaw_deg + 180.0) % 360.0 - 180.0) < 0.5
+
+
+@pytest.mark.parametrize(("seconds", "yaw_deg"), [(60, 0.0), (90, 90.0), (200, 90.0)])
+def test_a_yaw_that_is_likely_but_not_clear_is_drafted_by_the_quarter_turn(
+    seconds: int, yaw_deg: float, tmp_path: Path
+) -> None:
+    """Of runs of a minute or so 0 was drafted, and the heading was 90 deg off beside a compass that was right."""
+    items = [item for item in boat(Messages(2), 90.0) if item[1] < START_NS + seconds * S]
+    found, _, _ = look(tmp_path, items, Messages(2))
+    mount = found.imus[0].mount
+    assert mount.rpy_deg[2] == yaw_deg
+    assert ("not clearly" in mount.evidence) == (seconds == 90)
 
 
 def test_an_imu_that_sits_askew_is_not_taken_for_straight(tmp_path: Path) -> None:
@@ -566,6 +596,30 @@ def test_a_course_that_wanders_about_the_heading_tells_no_compass_to_a_degree(
     # A sine of 6 deg, the mean taken over each third of its period: 6 sinc(1/3) / sqrt(2) = 3.5 deg.
     assert compass.mount_offset_sigma_deg == (pytest.approx(3.5, abs=1.0) if leeway_deg else 1.0)
     assert ("its offset to the GNSS course wanders" in text) == bool(leeway_deg)
+
+
+def test_a_craft_that_goes_astern_for_a_while_has_no_worse_compass(tmp_path: Path) -> None:
+    """Half a minute astern of four was an offset that wanders by 69 deg: so much was drafted for the compass, which then told nothing."""
+    make, items = Messages(2), []
+    rng, rate_hz = np.random.default_rng(1), 20
+    t = np.arange(0.0, 180.0, 1.0 / rate_hz)
+    rate = 0.06 * np.sign(np.sin(2.0 * np.pi * t / 40.0))
+    yaw = np.cumsum(rate) / rate_hz
+    speed = np.where((t > 120.0) & (t < 150.0), -1.5, 1.5)
+    way = np.cumsum(speed * np.exp(1j * yaw)) / rate_hz
+    accel = np.gradient(speed, t) + 1j * speed * rate
+    lla = DATUM.geodetic_from_enu(np.column_stack([way.real, way.imag, 0.0 * t]))
+    for k in range(len(t)):
+        at = START_NS + k * S // rate_hz
+        felt, turns = (accel[k].real, accel[k].imag, G), (0.0, 0.0, rate[k])
+        items.append(("/imu", at, make.imu(at, rng.normal(felt, 0.01).tolist(), rng.normal(turns, 1e-3).tolist())))
+        if k % 5 == 0:
+            items.append(("/compass", at, make.compass(at, (0.0, 0.0, np.sin(0.5 * yaw[k]), np.cos(0.5 * yaw[k])))))
+            items.append(("/fix", at, make.fix(at, *lla[k])))
+    _, config, _ = look(tmp_path, items, make)
+    compass = config.sensors["compass"]
+    assert isinstance(compass, CompassConfig)
+    assert compass.mount_offset_sigma_deg < 5.0
 
 
 @pytest.mark.parametrize("turns", [True, False])

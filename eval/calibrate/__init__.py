@@ -116,6 +116,9 @@ def _suggestion(
         action = (
             "measure it; its mount comes from /tf_static: correct it there, or set xyz_m and rpy_deg without tf_frame"
         )
+    if name[1] == "yaw" and recording.imu is not None:
+        # Where fixes and the IMU's accelerations say the heading, the IMU's own yaw in the craft is in it, which is no state.
+        action += f"; or sensors.{recording.imu.sensor}.mount.rpy_deg[2] is off, the other way"
     if others:
         either = "; or ".join(_instead(n, e, recording, config) for n, e in others.items())
         action += f"; this run cannot tell it from {either}"

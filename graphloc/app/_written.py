@@ -14,8 +14,9 @@ from graphloc.app._run import Run, levers_m
 from graphloc.eval import metrics, report
 from graphloc.eval.docking import docking_table
 from graphloc.eval.ekf import named_tracks
+from graphloc.eval.holdout import suggested
 from graphloc.folders import fresh_folder
-from graphloc.measurements import TagSighting
+from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
@@ -64,9 +65,9 @@ def truth_statement(run: Run) -> str:
             f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; their own noise is part "
             "of the error. The track in this folder lacks them: for the best track run again without --hold-out."
         )
-    return (
-        "No truth and no held-out fixes: nothing here measures accuracy. `graphloc compare --hold-out gaps:8x10` does."
-    )
+    said = "No truth and no held-out fixes: nothing here measures accuracy"
+    by = suggested(run.recording.of(GnssPosition))
+    return f"{said}. `graphloc compare --hold-out {by}` does." if by else f"{said}; a `truth_topic` would."
 
 
 def report_data(run: Run, command: str = "") -> report.ReportData:
