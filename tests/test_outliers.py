@@ -498,6 +498,28 @@ def test_a_run_that_begins_in_a_jump_of_the_only_receiver_is_led_back(off_m: flo
     assert any("held longest" in w for w in found.stats.warnings)
 
 
+def test_a_receiver_that_comes_back_off_after_an_outage_is_right_when_that_is_over() -> None:
+    """Silent for 40 s, 15 m off for 10 s: the track had bent there, and what followed for 35 s was taken for its error."""
+    run, recording, config = jumping_alone(2.0, (55.0, 65.0), 100.0, off_m=15.0)
+    begin_ns, imu = int(run.truth.stamps_ns[0]), recording.imu
+    assert imu is not None
+    kept = [
+        m
+        for m in recording.measurements
+        if not (isinstance(m, GnssPosition) and 15.0 <= (m.stamp_ns - begin_ns) * 1e-9 < 55.0)
+    ]
+    recording = replace(
+        recording,
+        measurements=tuple(replace(m, seq=len(imu) + i) for i, m in enumerate(kept)),
+        message_count=len(imu) + len(kept),
+    )
+    found = app.smooth_recording(recording, config).solution
+    off = compare_to_truth(found.trajectory, run.truth)
+    assert off.position_max_m < 4.0
+    assert off.coverage_95 is not None
+    assert off.coverage_95 > 0.95
+
+
 @pytest.mark.parametrize("gnss_hz", [1.0, 5.0])
 def test_a_jump_of_the_only_receiver_is_not_followed_online(gnss_hz: float) -> None:
     """12 m for 12 s, and back. It was followed within seconds, past the fixes, with the heading turned."""

@@ -92,7 +92,7 @@ class BatchResult:
     headings: int  # number of candidates that explain the start about equally well; 0: nothing tells the heading there
     heading_var: Array  # (N,) rad^2 of each state, by headings that the motion does not exclude (see `_start`)
     begun: int  # last state of the first window: what comes later is not in `heading_var`
-    levels_cov: Array  # (3, 3) of the position, m^2, by other levels that may be the usual ones (see `_levels`)
+    levels_cov: Array  # (N, 3, 3) of the positions, m^2, by other levels that may be the usual ones (see `_levels`)
     notes: tuple[str, ...]
 
     def lightened(self) -> BatchResult:

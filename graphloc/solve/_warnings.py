@@ -167,7 +167,7 @@ def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[
         said = f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "
         said += "mount, a unit or a time offset is wrong"
         warnings.append(Graded(said, "cost", result.cost / expected))
-    if (beside_m := largest_sigma(result.levels_cov)) > _LEVELS_M:
+    if (beside_m := max(map(largest_sigma, result.levels_cov))) > _LEVELS_M:
         warnings.append(
             "the fixes jump, and no other sensor shows which level is right: the one held longest is taken, "
             f"and the bounds include {beside_m:.1f} m (1 sigma) for the others"
