@@ -210,6 +210,30 @@ def test_a_jump_that_lasts_longer_than_the_level_before_it_is_the_right_level(
     assert [*lost_s, 300][0] == pytest.approx(lost_after_s, abs=1)
 
 
+@pytest.mark.parametrize(("silent_s", "held_s"), [(15, 135), (60, 20)])
+def test_a_level_that_dead_reckoning_may_have_bent_to_is_held_since_the_outage(silent_s: int, held_s: int) -> None:
+    """Usual for 100 s, silent, usual for 20 s, then a jump for 10 s: the longer it is held, the surer it is that this is no end of one."""
+    lag = after_12_s()
+    fix = lag.problem.streams["gnss"]
+    entry = lag._judge._group(fix)[-1]  # noqa: SLF001
+    agreement = Agreement(lag.problem.timeline)
+
+    def agrees(from_s: int, until_s: int, off_m: float) -> int:
+        at = replace(entry.verdict.at, slow_value=np.array([off_m, 0.0, 0.0]))
+        stamps_ns = [lag.newest.stamp_ns + t_s * 1_000_000_000 for t_s in range(from_s, until_s + 1)]
+        for stamp_ns in stamps_ns:
+            agreement.note(
+                fix, replace(entry.measurement, stamp_ns=stamp_ns), replace(entry.verdict, weight=1.0, at=at)
+            )
+        return stamps_ns[-1]
+
+    back_s = 100 + silent_s
+    agrees(0, 100, 0.5)
+    agrees(back_s, back_s + 20, 0.5)
+    now_ns = agrees(back_s + 21, back_s + 31, 15.0)
+    assert agreement.wrong_level(now_ns) == pytest.approx(1.0 / (1.0 + np.exp((held_s - 10) / 30.0)))
+
+
 def test_a_rebuild_does_not_begin_the_wait_for_the_end_of_a_jump_anew() -> None:
     """The rebuilt window notes what is in it; a level that has been held for longer would seem to begin there."""
     lag = after_12_s()

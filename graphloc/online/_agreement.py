@@ -18,6 +18,7 @@ _FEW = 8  # absolute measurements in a row must disagree; fewer are no sign
 # Of disagreement, until the estimate is lost; measurements of one sensor in a row that must disagree.
 _LOST_S, _DENIES = 15.0, 3
 _JUMPED_S = (60.0, 200.0)  # the longest a jump lasts: after a short, and after a long time at the level before it
+_BENT_S = 20.0  # without a position, dead reckoning is as far off as a slow error
 
 
 class Agreement:
@@ -35,6 +36,7 @@ class Agreement:
         self._denied: dict[str, int] = {}  # by sensor: how many in a row disagreed, whatever slow error is allowed
         self._usual_ns: tuple[int, int] | None = None  # first and last stamp at the usual level
         self._jumped_ns: int | None = None  # since when sensors agree only by a jump
+        self._told_ns = 0  # stamp of the last one that agreed, by whatever level
 
     def note(self, stream: LiveStream, m: Measurement, verdict: Verdict | None) -> None:
         """Note how a measurement was judged; verdict None: it was rejected without being judged."""
@@ -54,10 +56,13 @@ class Agreement:
 
     def _note_level(self, stamp_ns: int, *, usual: bool) -> None:
         if usual:
-            self._usual_ns = (self._usual_ns or (stamp_ns, stamp_ns))[0], stamp_ns
+            # After an outage the estimate follows what comes, at whatever level: how long it had been held before says nothing of that.
+            bent = stamp_ns - self._told_ns > _BENT_S * 1e9
+            self._usual_ns = stamp_ns if bent or self._usual_ns is None else self._usual_ns[0], stamp_ns
             self._jumped_ns = None
         elif self._jumped_ns is None:
             self._jumped_ns = stamp_ns
+        self._told_ns = max(stamp_ns, self._told_ns)
 
     def forget_refused(self) -> None:
         """Forget disagreement: a receiver turned out to be frozen, so it is no evidence against the estimate."""
@@ -67,11 +72,12 @@ class Agreement:
 
     def marked(self) -> _Mark:
         """Return the state, for `back_to`."""
-        return dict(self.agreed_ns), list(self._refused), dict(self._denied), self._usual_ns, self._jumped_ns
+        levels = self._usual_ns, self._jumped_ns, self._told_ns
+        return dict(self.agreed_ns), list(self._refused), dict(self._denied), *levels
 
     def back_to(self, mark: _Mark) -> None:
         """Forget what was noted since `marked`: it agreed with choices that were given up."""
-        self.agreed_ns, self._refused, self._denied, self._usual_ns, self._jumped_ns = mark
+        self.agreed_ns, self._refused, self._denied, self._usual_ns, self._jumped_ns, self._told_ns = mark
 
     def inherit(self, before: Agreement) -> None:
         """Take over when each sensor last agreed, and since when one has been at its usual or another level.
@@ -81,7 +87,7 @@ class Agreement:
                 would seem to begin with it.
         """
         self.agreed_ns.update(before.agreed_ns)
-        self._usual_ns = before._usual_ns
+        self._usual_ns, self._told_ns = before._usual_ns, before._told_ns
         begin_ns = self._timeline.stamps_ns[self._timeline.first]
         if before._jumped_ns is not None and before._jumped_ns < begin_ns:
             self._jumped_ns = before._jumped_ns
@@ -115,7 +121,7 @@ class Agreement:
         return jumped_s if jumped_s > float(np.clip(end - begin, *_JUMPED_S)) else 0.0
 
 
-_Mark = tuple[dict[str, int], list[int], dict[str, int], tuple[int, int] | None, int | None]
+_Mark = tuple[dict[str, int], list[int], dict[str, int], tuple[int, int] | None, int | None, int]
 
 
 def _credible(stream: LiveStream, at: Attachment) -> bool:
