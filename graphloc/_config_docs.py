@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from typing import Literal, get_args, get_origin
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from graphloc.blocks import MountConfig
 from graphloc.config import (
@@ -77,8 +79,15 @@ def _table(model: type[BaseModel]) -> str:
     lines = ["| key | default | meaning |", "|---|---|---|"]
     for name, field in model.model_fields.items():
         default = "required" if field.is_required() else _value(field.get_default(call_default_factory=True))
-        lines.append(f"| `{name}` | {default} | {' '.join((field.description or '').split())} |")
+        lines.append(f"| `{name}` | {default} | {_meaning(field)} |")
     return "\n".join(lines) + "\n"
+
+
+def _meaning(field: FieldInfo) -> str:
+    """Its description, and the values that it may have where it does not name them all."""
+    said = " ".join((field.description or "").split())
+    values = [f"`{value}`" for value in get_args(field.annotation)] if get_origin(field.annotation) is Literal else []
+    return said if len(values) < 2 or all(value in said for value in values) else f"{said} One of {', '.join(values)}."
 
 
 def _value(value: object) -> str:

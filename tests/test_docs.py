@@ -83,6 +83,14 @@ def test_the_reference_of_keys_names_keys_and_begins_with_a_valid_file(tmp_path:
     assert [sensor.kind for sensor in config.sensors.values()] == ["imu", "gnss", "compass", "height"]
 
 
+@pytest.mark.parametrize(
+    ("key", "value"), [("unit", "knots"), ("gyro_unit", "deg/s"), ("through", "water"), ("gravity", "removed")]
+)
+def test_the_reference_of_keys_names_the_values_of_those_that_have_few(key: str, value: str) -> None:
+    rows = (ROOT / "docs/configuration.md").read_text(encoding="utf-8").splitlines()
+    assert any(row.startswith(f"| `{key}` |") and f"`{value}`" in row for row in rows)
+
+
 def test_the_example_of_calibration_has_the_numbers_of_its_rows() -> None:
     rows = {row["name"]: row["value"] for row in json.loads((ROOT / "docs/results.json").read_text())["figures"]}
     said = re.search(r"time_offset_s: ([\d.]+) \+- ([\d.]+) s", (ROOT / "docs/calibration.md").read_text())
