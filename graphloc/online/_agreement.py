@@ -55,10 +55,11 @@ class Agreement:
             self._refused.append(m.stamp_ns)
 
     def _note_level(self, stamp_ns: int, *, usual: bool) -> None:
+        if stamp_ns - self._told_ns > _BENT_S * 1e9 and self._jumped_ns is None:
+            # The estimate follows what comes now, at whatever level: how long one had been held before says nothing of that.
+            self._usual_ns = None
         if usual:
-            # After an outage the estimate follows what comes, at whatever level: how long it had been held before says nothing of that.
-            bent = stamp_ns - self._told_ns > _BENT_S * 1e9
-            self._usual_ns = stamp_ns if bent or self._usual_ns is None else self._usual_ns[0], stamp_ns
+            self._usual_ns = (self._usual_ns or (stamp_ns, stamp_ns))[0], stamp_ns
             self._jumped_ns = None
         elif self._jumped_ns is None:
             self._jumped_ns = stamp_ns

@@ -43,7 +43,7 @@ from graphloc.frames import Array
 from graphloc.recording import Progress, quiet
 from graphloc.solve._align import align
 from graphloc.solve._choices import other_choices, take_more_probable
-from graphloc.solve._decide import AGREES, Stage, Verdicts, weigh
+from graphloc.solve._decide import AGREES, Stage, Verdicts, agrees, met, weigh
 from graphloc.solve._grow import grow
 from graphloc.solve._imu_noise import with_needed_noise
 from graphloc.solve._levels import at_usual_level
@@ -153,9 +153,10 @@ def solve_batch(
         solved = as_stated.settled_again(begun.prior, progress)
         passes, iterations = passes + solved.settled.passes, iterations + solved.settled.iterations
     problem, last = solved
-    problem, settled, prior, levels_cov = at_usual_level(problem, last, begun.prior, progress, _LAST_PASSES)
-    if settled is not last:
-        passes, iterations = passes + settled.passes, iterations + settled.iterations
+    problem, settled, prior, levels_cov, passed, used = at_usual_level(
+        problem, last, begun.prior, progress, _LAST_PASSES, newest=newest
+    )
+    passes, iterations = passes + passed, iterations + used
     return BatchResult(
         problem=problem,
         values=settled.values,
@@ -286,6 +287,7 @@ def _begun_without_a_sensor(problem: Problem, few: Thinned, begun: Begun, progre
     def cost(values: gtsam.Values, prior: StartPrior, last: int) -> float:
         return cost_as_configured(few.problem, values, 0, last, prior, judged=last)
 
+    lowest, best, iterations = -_CLEARLY, None, begun.iterations
     for stream in few.problem.streams:
         if stream.row.absolute or stream.row.false is not None or not stream.measurements:
             continue
@@ -295,14 +297,21 @@ def _begun_without_a_sensor(problem: Problem, few: Thinned, begun: Begun, progre
             other = solve_start(rest, align(without_sensor(problem, whole)), progress, newest=True, window_s=window_s)
         except SolveError:
             continue
+        iterations += other.iterations
         last = min(begun.last, other.last)
-        lower = cost(begun.values, begun.prior, last) - cost(other.values, other.prior, last)
-        if other.excess < CONTRADICTION and lower > _CLEARLY:
-            # The sensor may tell the heading after all.
-            return begun._replace(
-                values=other.values, prior=other.prior, last=other.last, heading_var=np.zeros(other.last + 1)
-            )
-    return None
+        higher = cost(other.values, other.prior, last) - cost(begun.values, begun.prior, last)
+        if other.excess < CONTRADICTION and higher < lowest:
+            lowest, best = higher, (stream, other)
+    if best is None:
+        return None
+    stream, other = best
+    _, residuals = met(few.problem, stream, stream.between(0, other.last), other.values)
+    agree = np.mean([any(agrees(stream, residual) for residual in found) for found in residuals])
+    # Where it tells the heading after all, no other one is in doubt.
+    heading_var = np.zeros(other.last + 1) if agree > 1.0 - _MOSTLY else other.heading_var
+    return begun._replace(
+        values=other.values, prior=other.prior, last=other.last, iterations=iterations, heading_var=heading_var
+    )
 
 
 def _doubt_at_once(problem: Problem, last: int, progress: Progress) -> None:

@@ -24,12 +24,13 @@ from graphloc.graph import SlowProcess
 from graphloc.position_jumps import MEAN_S
 from graphloc.recording import Progress
 from graphloc.solve._decide import Stage, Verdicts, decisions, weigh
-from graphloc.solve._passes import Settled, settle
+from graphloc.solve._passes import Settled, cost_as_configured, settle
 from graphloc.time import NS_PER_S
 
 _JUMP = 1.0  # sigmas from one node to the next: ten times the drift
 _FAR = 2.0  # sigmas: nearer, the error is at its usual level
-_OUTAGE_S, _MOST_OUTAGES, _MOST_LEVELS = 10.0, 4, 3  # each level after each outage is another solution of the whole run
+# Each level after each outage is another solution of the whole run.
+_OUTAGE_S, _MOST_OUTAGES, _MOST_LEVELS, _TRIAL_PASSES = 10.0, 4, 3, 6
 _COMES_BACK_OFF = 2.0  # nats: of a receiver that does after an outage
 
 
@@ -38,21 +39,22 @@ class AtLevel(NamedTuple):
 
     Attributes:
         others_cov: covariance (N, 3, 3) of the position of each state that the other levels add, m^2, in world.
+        passes, iterations: that it took.
     """
 
     problem: Problem
     settled: Settled
     prior: StartPrior
     others_cov: Array
+    passes: int
+    iterations: int
 
 
 class _Case(NamedTuple):
-    """A solution, the receivers whose error may be far off in it, and the passes and iterations of those it was compared with."""
+    """A solution, and the receivers whose error may be far off in it."""
 
     problem: Problem
     settled: Settled
-    passes: int = 0
-    iterations: int = 0
 
     @property
     def streams(self) -> list[Stream]:
@@ -66,7 +68,8 @@ class _Case(NamedTuple):
     def levels(self, from_ns: int | None = None, until_ns: int | None = None) -> list[Array]:
         """Return the levels (3,), m, of the errors, of a span: each once, without the usual one."""
         stamps_ns = self.problem.timeline.slow_stamps_ns
-        first, last = np.searchsorted(stamps_ns, [from_ns or stamps_ns[0], until_ns or stamps_ns[-1] + 1])
+        first = 0 if from_ns is None else int(np.searchsorted(stamps_ns, from_ns))
+        last = None if until_ns is None else int(np.searchsorted(stamps_ns, until_ns))
         pairs = zip(self.streams, self.paths(), strict=True)
         return [level for s, path in pairs for level in _levels(s.slow, path[first:last])]
 
@@ -82,23 +85,27 @@ class _Case(NamedTuple):
         return np.array([self.settled.values.atPose3(keys.pose(k)).translation() for k in states])
 
 
-def at_usual_level(problem: Problem, settled: Settled, prior: StartPrior, progress: Progress, most: int) -> AtLevel:
+def at_usual_level(
+    problem: Problem, settled: Settled, prior: StartPrior, progress: Progress, most: int, *, newest: bool
+) -> AtLevel:
     """Return the solution with the most probable level as the usual one, settled in at most `most` passes.
 
     It is held there: with tails on either side, a level that is left after a quarter of the run weighs as much as the other.
+
+    Args:
+        newest: the last state alone is asked for, and soon.
     """
-    case, others = _Case(problem, settled), np.zeros((len(problem.timeline), 3, 3))
+    case, others, passes, iterations = _Case(problem, settled), np.zeros((len(problem.timeline), 3, 3)), 0, 0
     if not case.levels() or _told_otherwise(problem, settled.verdicts):
-        return AtLevel(problem, settled, prior, others)
-    outages = _outages(case)
-    for n, gap_ns in enumerate(outages):
-        next_ns = outages[n + 1][0] if n + 1 < len(outages) else None
-        case, beside = _after_outage(case, gap_ns, next_ns, prior, progress, most)
+        return AtLevel(problem, settled, prior, others, 0, 0)
+    for span_ns in () if newest else _outages(case):
+        case, beside, tried = _after_outage(case, span_ns, prior, progress)
         others += beside
+        passes, iterations = passes + tried[0], iterations + tried[1]
     levels = [np.zeros(3), *case.levels()]
     costs = np.array([case.cost(_cost, level) for level in levels])
     usual = levels[int(np.argmin(costs))]
-    problem, settled, *_ = case
+    problem, settled = case
     moved, prior_there = _moved(case, -usual), _prior_moved(prior, -usual)
     last, decided = len(problem.timeline) - 1, decisions(settled.verdicts)
     here, there = (
@@ -106,62 +113,76 @@ def at_usual_level(problem: Problem, settled: Settled, prior: StartPrior, progre
         for values, about in ((settled.values, prior), (moved, prior_there))
     )
     rise = there - here - (case.cost(standing_cost, usual) - case.cost(standing_cost, levels[0]))
+    as_it_is = AtLevel(problem, settled, prior, others, passes, iterations)
     if rise > costs[0] - costs.min():
-        return AtLevel(problem, settled, prior, others)  # another sensor determines the position
+        return as_it_is  # another sensor determines the position
     share = np.exp(costs.min() - costs)
     beside = np.array(levels) - usual
-    others += np.einsum("n,ni,nj->ij", share / share.sum(), beside, beside)
+    others = others + np.einsum("n,ni,nj->ij", share / share.sum(), beside, beside)
     problem = replace(problem, streams=tuple(_held(s, case, usual) for s in problem.streams))
     verdicts = weigh(problem, moved, first=0, last=last, stage=Stage.FINAL)
-    held = settle(problem, moved, verdicts, prior_there, progress, most)
-    held = replace(held, passes=held.passes + case.passes, iterations=held.iterations + case.iterations)
-    return AtLevel(problem, held, prior_there, others)
+    try:
+        held = settle(problem, moved, verdicts, prior_there, progress, most)
+    except SolveError:
+        return as_it_is
+    return AtLevel(problem, held, prior_there, others, passes + held.passes, iterations + held.iterations)
 
 
-def _outages(case: _Case) -> list[tuple[int, int]]:
-    """Return where (from the last fix to the next one, ns) none of the receivers tells the position for long; the longest ones."""
+class _Span(NamedTuple):
+    """An outage, from the last fix to the next one, and where the one before it ends and the one after it begins (stamps, ns)."""
+
+    gap_ns: tuple[int, int]
+    from_ns: int | None
+    until_ns: int | None
+
+
+def _outages(case: _Case) -> list[_Span]:
+    """Return where none of the receivers tells the position for long: the longest outages."""
     stamps_ns = np.sort([m.stamp_ns for s in case.streams for m in s.measurements])
     gaps_ns = np.diff(stamps_ns)
     longest = np.sort(np.argsort(gaps_ns)[-_MOST_OUTAGES:])
-    return [(int(stamps_ns[n]), int(stamps_ns[n + 1])) for n in longest if gaps_ns[n] > _OUTAGE_S * NS_PER_S]
+    found = [(int(stamps_ns[n]), int(stamps_ns[n + 1])) for n in longest if gaps_ns[n] > _OUTAGE_S * NS_PER_S]
+    begins, ends = [begin for begin, _ in found], [end for _, end in found]
+    return [_Span(*one) for one in zip(found, [None, *ends[:-1]], [*begins[1:], None], strict=True)] if found else []
 
 
 def _after_outage(
-    case: _Case, gap_ns: tuple[int, int], next_ns: int | None, prior: StartPrior, progress: Progress, most: int
-) -> tuple[_Case, Array]:
-    """Return the most probable solution with what follows an outage at another level, and the covariance (N, 3, 3) that the others add.
+    case: _Case, span: _Span, prior: StartPrior, progress: Progress
+) -> tuple[_Case, Array, tuple[int, int]]:
+    """Return the most probable solution with what follows an outage at another level.
 
-    There dead reckoning bends, so the receiver may have come back with an error, which is over when it jumps.
+    There dead reckoning bends, so a receiver may have come back with an error, or without the one that it had.
 
-    Args:
-        next_ns: when the next outage begins.
+    Returns:
+        The solution, the covariance (N, 3, 3) that the others add, and the passes and iterations of all of them.
     """
-    best, costs, places, passes, iterations = case, [_total(case)], [case.places()], case.passes, case.iterations
-    for level in case.levels(gap_ns[1], next_ns)[:_MOST_LEVELS]:
-        size_m = float(np.linalg.norm(level))
-        streams = (_jumping(s, gap_ns[1], size_m) if s in case.streams else s for s in case.problem.streams)
+    best, costs, places, passes, iterations = case, [_total(case, prior)], [case.places()], 0, 0
+    for level in case.levels(span.from_ns, span.until_ns)[:_MOST_LEVELS]:
+        size_m, back_ns = float(np.linalg.norm(level)), span.gap_ns[1]
+        streams = (_jumping(s, back_ns, size_m) if s in case.streams else s for s in case.problem.streams)
         problem = replace(case.problem, streams=tuple(streams))
-        moved = _moved(case, -level, gap_ns)
+        moved = _moved(case, -level, span.gap_ns)
         verdicts = weigh(problem, moved, first=0, last=len(problem.timeline) - 1, stage=Stage.FINAL)
         try:
-            other = _Case(problem, settle(problem, moved, verdicts, prior, progress, most))
+            other = _Case(problem, settle(problem, moved, verdicts, prior, progress, _TRIAL_PASSES))
         except SolveError:
             continue
         passes, iterations = passes + other.settled.passes, iterations + other.settled.iterations
-        cost = _COMES_BACK_OFF + _total(other)
+        cost = _COMES_BACK_OFF + _total(other, prior)
         if cost < min(costs):
             best = other
         costs.append(cost)
         places.append(other.places())
     share = np.exp(min(costs) - np.array(costs))
     beside = np.array(places) - places[int(np.argmin(costs))]
-    best = best._replace(passes=passes, iterations=iterations)
-    return best, np.einsum("c,cni,cnj->nij", share / share.sum(), beside, beside)
+    return best, np.einsum("c,cni,cnj->nij", share / share.sum(), beside, beside), (passes, iterations)
 
 
-def _total(case: _Case) -> float:
+def _total(case: _Case, prior: StartPrior) -> float:
     """Return the cost (nats) of all measurements, and of the time that a receiver is far off."""
-    return float(case.settled.graph.error(case.settled.values)) + case.cost(_away_cost, np.zeros(3))
+    last = len(case.problem.timeline) - 1
+    cost = cost_as_configured(case.problem, case.settled.values, 0, last, prior, judged=last)
+    return cost + case.cost(_away_cost, np.zeros(3))
 
 
 def _jumping(stream: Stream, at_ns: int, size_m: float) -> Stream:
@@ -178,12 +199,12 @@ def _told_otherwise(problem: Problem, verdicts: Verdicts) -> bool:
 
 
 def _levels(slow: SlowProcess | None, path: Array) -> list[Array]:
-    """Return the levels (3,), m, of an error (N, 3) between its jumps: each once, without the usual one."""
+    """Return the levels (3,), m, of an error (N, 3) between its jumps: each once, without the usual one, the one held longest first."""
     assert slow is not None
     held = path * slow.far_axes
     jumps = 1 + np.flatnonzero(np.linalg.norm(np.diff(held / slow.sigma, axis=0), axis=1) > _JUMP)
     found: list[Array] = []
-    for part in np.split(held, jumps) if len(jumps) else []:
+    for part in sorted(np.split(held, jumps), key=len, reverse=True) if len(jumps) else []:
         level = np.median(part, axis=0)
         if all(np.linalg.norm((level - other) / slow.sigma) > _FAR for other in (np.zeros(3), *found)):
             found.append(level)
