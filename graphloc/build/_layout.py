@@ -67,10 +67,10 @@ def make_problem(
     imu = usable_imu(recording, config, inertial.kind)
     t_body_imu, R = mount_of(imu.sensor, config.sensors[imu.sensor], recording.mounts)
 
-    def relink(imu_config: Any, noise_scale: float) -> InertialLink:
-        return inertial.link(imu, imu_config, R, datum.gravity_mps2, noise_scale)
+    def relink(imu_config: Any, noise_scale: float, R_body_imu: Array) -> InertialLink:
+        return inertial.link(imu, imu_config, R_body_imu, datum.gravity_mps2, noise_scale)
 
-    links = relink(config.sensors[imu.sensor], 1.0)
+    links = relink(config.sensors[imu.sensor], 1.0, R)
     inside, rejected, warnings = sorted_out(recording, config, {row.kind for row in rows}, imu)
     warnings += [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
     timeline = make_timeline(int(imu.stamps_ns[0]), int(imu.stamps_ns[-1]), inside, config.timeline)

@@ -80,8 +80,9 @@ class Problem:
     """A run, ready to be solved.
 
     Attributes:
-        t_body_imu_m, R_body_imu: (3,), (3, 3) mount of the IMU in body.
-        relink: makes the inertial links for a configuration of the IMU and a noise scale. links: those of `noise_scale`.
+        t_body_imu_m, R_body_imu: (3,), (3, 3) mount of the IMU in body. imu_turn_rad: (3,) by which it is turned against the configured
+            one, body axes.
+        relink: makes the inertial links for a configuration of the IMU, a noise scale and a mount (3, 3). links: those of `noise_scale`.
         preintegrated, inertial: motion from each state to the next, and its factor; neither depends on the estimate, so all graphs
             share them.
         rejected: ledger rows of measurements that the graph cannot take.
@@ -96,7 +97,7 @@ class Problem:
     imu: ImuSeries
     t_body_imu_m: Array
     R_body_imu: Array
-    relink: Callable[[Any, float], InertialLink]
+    relink: Callable[[Any, float, Array], InertialLink]
     links: InertialLink
     noise_scale: float
     preintegrated: tuple[Any, ...]
@@ -106,6 +107,7 @@ class Problem:
     warnings: tuple[str, ...] = field(default=())
     silent: str = ""
     left_out: tuple[tuple[int, int], ...] = ()
+    imu_turn_rad: Array = field(default_factory=lambda: np.zeros(3))
     usual_motion: UsualMotion | None = None
 
 
@@ -154,7 +156,7 @@ def _relinked(problem: Problem, config: VesselConfig, noise_scale: float) -> Pro
 def _links(
     problem: Problem, config: VesselConfig, noise_scale: float, left_out: Sequence[tuple[int, int]]
 ) -> InertialLink:
-    links = problem.relink(config.sensors[problem.imu.sensor], noise_scale)
+    links = problem.relink(config.sensors[problem.imu.sensor], noise_scale, problem.R_body_imu)
     for span in left_out:
         links.leave_out(*span)
     return links
@@ -166,6 +168,18 @@ def without_imu(problem: Problem, values: gtsam.Values, after_ns: int, until_ns:
     links = _links(problem, problem.config, problem.noise_scale, left_out)
     streams = tuple(_carried_anew(s, problem.timeline, links, after_ns, until_ns) for s in problem.streams)
     return _bridged(replace(problem, links=links, left_out=left_out, streams=streams), values, [(after_ns, until_ns)])
+
+
+def with_imu_turned(problem: Problem, values: gtsam.Values, turn_rad: Array) -> Problem:
+    """Return the problem with the mount of its IMU turned by a small rotation (3,), rad, body axes; IMU gaps are bridged by `values`."""
+    R = gtsam.Rot3.Expmap(turn_rad).matrix() @ problem.R_body_imu
+    turned = replace(problem, R_body_imu=R, imu_turn_rad=problem.imu_turn_rad + turn_rad)
+    turned = _relinked(turned, problem.config, problem.noise_scale)
+    always = np.iinfo(np.int64)
+    streams = tuple(
+        _carried_anew(s, problem.timeline, turned.links, int(always.min), int(always.max)) for s in problem.streams
+    )
+    return bridged(replace(turned, streams=streams), values)
 
 
 def without_sensor(problem: Problem, stream: Stream) -> Problem:

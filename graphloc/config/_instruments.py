@@ -43,6 +43,9 @@ class ImuConfig(SensorConfig):
     """Turn-on accelerometer bias, 1 sigma, mg."""
     gyro_bias_sigma_dps: Positive = 2.0
     """Turn-on gyroscope bias, 1 sigma, deg/s, before the start alignment has measured it."""
+    mount_sigma_deg: NonNegative = 1.0
+    """Unknown attitude error of its mount, 1 sigma, each axis, deg. Offline it is estimated with the run, and the bounds include what is
+    left of it. 0: the IMU's axes are those of the vessel by definition, or were calibrated to a tenth of a degree."""
     adapt_noise: bool = True
     """Raise the noise (never lower it, and with a warning) if the run contradicts it, or the IMU's own residuals do."""
     max_gap_s: Positive = 0.5
@@ -51,6 +54,11 @@ class ImuConfig(SensorConfig):
     """A longer gap is not bridged: the run is cut there and its parts are solved separately, s."""
     kernel: KernelConfig = KernelConfig(kind="none")
     """Robust loss: not used for inertial data."""
+
+    @property
+    def mount_sigma_rad(self) -> float:
+        """Attitude error of the mount, 1 sigma, rad."""
+        return float(np.radians(self.mount_sigma_deg))
 
     @property
     def accel_noise_mps2(self) -> float:

@@ -45,6 +45,7 @@ from graphloc.solve._align import align
 from graphloc.solve._choices import other_choices, take_more_probable
 from graphloc.solve._decide import AGREES, Stage, Verdicts, agrees, met, weigh
 from graphloc.solve._grow import grow
+from graphloc.solve._imu_mount import with_mount_estimated
 from graphloc.solve._imu_noise import with_needed_noise
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
@@ -122,6 +123,8 @@ def solve_batch(
         SolveError: it could not be started, or the linear algebra failed.
     """
     begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu)
+    if not newest:
+        solved = solved.with_mount_estimated(begun.prior, progress)
     as_stated, misfit = solved.choice(), solved.misfit()
     passes, iterations = solved.settled.passes, begun.iterations + solved.settled.iterations
     for _ in range(_MAX_NOISE_ROUNDS):
@@ -197,6 +200,14 @@ class _Solved(NamedTuple):
     def misfit(self) -> float:
         """Return the cost over its expectation."""
         return cost_without_outliers(self.settled) / max(expected_cost(self.problem, self.settled.verdicts), 1.0)
+
+    def with_mount_estimated(self, prior: StartPrior, progress: Progress) -> _Solved:
+        """Return it with the mount of the IMU as the other sensors have it."""
+        problem, settled = with_mount_estimated(*self, prior, progress, _LAST_PASSES)
+        if settled is self.settled:
+            return self
+        passes, iterations = (getattr(self.settled, key) + getattr(settled, key) for key in ("passes", "iterations"))
+        return _Solved(problem, replace(settled, passes=passes, iterations=iterations))
 
     def choice(self) -> _Choice:
         return _Choice(self.problem, self.settled.values, self.settled.verdicts)

@@ -28,9 +28,10 @@ from graphloc.solve._covariances import (
 )
 from graphloc.solve._doubt import widen_by_doubt
 from graphloc.solve._health import health_over_time, misfits, since_agreed
+from graphloc.solve._imu_mount import mount_error
 from graphloc.solve._ledger import ledger_of
 from graphloc.solve._unmodelled import unmodelled
-from graphloc.solve._warnings import stats_of
+from graphloc.solve._warnings import mount_warning, stats_of
 from graphloc.trajectory import Trajectory
 
 _NEAR_BERTH_M = 60.0
@@ -46,8 +47,8 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     R = np.array([p.rotation().matrix() for p in poses])
     bias = [values.atConstantBias(keys.bias(int(j))) for j in slow_of]
     gyro_bias = np.array([b.gyroscope() for b in bias])
-    raw = problem.links.gyro_at(problem.timeline.stamps_ns)
-    gyro = raw - gyro_bias @ problem.R_body_imu.T
+    raw = result.problem.links.gyro_at(problem.timeline.stamps_ns)
+    gyro = raw - gyro_bias @ result.problem.R_body_imu.T
     # From the IMU's place to the body's origin.
     lever = -problem.t_body_imu_m
     trajectory = Trajectory(
@@ -64,6 +65,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     guess = _add_others(result, trajectory.cov)
     unsaid = [
         *_add_unmodelled(result, trajectory.cov, v_cov),
+        *_add_mount(result, R, trajectory.cov, v_cov),
         *(guess or _add_guess(result, trajectory.cov)),
         *_add_doubt(result, trajectory.cov),
     ]
@@ -118,6 +120,20 @@ def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
         cov[:, 3:, 3:] += more.rotation
         v_cov += more.velocity
     return []
+
+
+def _add_mount(result: BatchResult, R: Array, cov: Array, v_cov: Array) -> list[str]:
+    """Add what is not known of the IMU's mount; return a warning where that fails, or where the mount is far from what is configured."""
+    problem = result.problem
+    try:
+        found = mount_error(problem, result.graph, result.values)
+    except (RuntimeError, np.linalg.LinAlgError, MemoryError) as error:
+        return [f"the bounds do not include that the IMU's mount may be off ({in_one_line(error)})"]
+    if found is None:
+        return []
+    cov += found.pose_covariance(R, -problem.t_body_imu_m)
+    v_cov += found.velocity_covariance()
+    return mount_warning(problem, found)
 
 
 def _add_others(result: BatchResult, cov: Array) -> list[str]:

@@ -17,6 +17,7 @@ from graphloc.solution import Graded, SolveStats
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
 from graphloc.solve._decide import AGREES
 from graphloc.solve._health import CONTRADICTING_COST
+from graphloc.solve._imu_mount import MountError
 from graphloc.solve._imu_noise import too_quiet
 from graphloc.solve._passes import expected_cost
 from graphloc.time import stamps_of, utc_text
@@ -139,6 +140,19 @@ def _noisier(stream: Stream, result: BatchResult) -> float:
         return 1.0
     found = [result.verdicts[stream.number, i].decision for i in range(len(stream.measurements))]
     return max((decision.weight**-0.5 for decision in found if decision is not None), default=1.0)
+
+
+def mount_warning(problem: Problem, error: MountError) -> list[str]:
+    """Say where the other sensors have the mount of the IMU far from where it is configured: a line, or none."""
+    turn = problem.imu_turn_rad + error.turn_rad
+    sigma = problem.config.sensors[problem.imu.sensor].mount_sigma_rad
+    far = float(np.abs(turn).max() / sigma)
+    if far < _TURNED:
+        return []
+    axes = zip(("roll", "pitch", "yaw"), np.degrees(turn), np.degrees(np.sqrt(np.diagonal(error.cov))), strict=True)
+    where = ", ".join(f"{axis} {off:+.1f} +- {sigma_deg:.1f} deg" for axis, off, sigma_deg in axes)
+    said = f"{problem.imu.sensor}: the other sensors turn its mount by {far:.1f} sigmas ({where}): check its mount and theirs"
+    return [Graded(said, "mount of the IMU", far)]
 
 
 def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
