@@ -6,7 +6,8 @@
    new in a window are judged by the prediction without them, with its covariance (`_grow`). Both on a
    thinned run (`graphloc.build.thinned`). Passes over all of it remove the seams: there they cost a fifth.
 3. Passes over the whole run: modes and weights re-chosen until they no longer change (`_passes`).
-4. Try other choices that may be more probable (`_choices`), and repeat 3 where there are any.
+4. Try other choices that may be more probable (`_choices`), and repeat 3 where there are any. Where the IMU's mount is clearly off,
+   repeat 3 with it turned (`_imu_mount`).
 5. Where receivers jump and no other sensor measures position, choose the most probable level (`_levels`).
 6. A Bayes tree of the last graph gives the covariances of every state.
 
@@ -45,7 +46,7 @@ from graphloc.solve._align import align
 from graphloc.solve._choices import other_choices, take_more_probable
 from graphloc.solve._decide import AGREES, Stage, Verdicts, agrees, met, weigh
 from graphloc.solve._grow import grow
-from graphloc.solve._imu_mount import with_mount_estimated
+from graphloc.solve._imu_mount import MountError, with_mount_estimated
 from graphloc.solve._imu_noise import with_needed_noise
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
@@ -94,6 +95,7 @@ class BatchResult:
     heading_var: Array  # (N,) rad^2 of each state, by headings that the motion does not exclude (see `_start`)
     begun: int  # last state of the first window: what comes later is not in `heading_var`
     levels_cov: Array  # (N, 3, 3) of the positions, m^2, by other levels that may be the usual ones (see `_levels`)
+    mount: MountError | None  # what is known of that of the IMU (see `_imu_mount`); None: not reckoned for this graph
     notes: tuple[str, ...]
 
     def lightened(self) -> BatchResult:
@@ -123,8 +125,9 @@ def solve_batch(
         SolveError: it could not be started, or the linear algebra failed.
     """
     begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu)
+    mount = None
     if not newest:
-        solved = solved.with_mount_estimated(begun.prior, progress)
+        solved, mount = solved.with_mount_estimated(begun.prior, progress)
     as_stated, misfit = solved.choice(), solved.misfit()
     passes, iterations = solved.settled.passes, begun.iterations + solved.settled.iterations
     for _ in range(_MAX_NOISE_ROUNDS):
@@ -176,6 +179,7 @@ def solve_batch(
         begun=begun.last,
         headings=begun.headings if begun.start.yaw_sigma_rad < np.pi else 0,
         levels_cov=levels_cov,
+        mount=mount if settled.values is as_stated.values else None,
         notes=begun.start.notes,
     )
 
@@ -201,13 +205,13 @@ class _Solved(NamedTuple):
         """Return the cost over its expectation."""
         return cost_without_outliers(self.settled) / max(expected_cost(self.problem, self.settled.verdicts), 1.0)
 
-    def with_mount_estimated(self, prior: StartPrior, progress: Progress) -> _Solved:
-        """Return it with the mount of the IMU as the other sensors have it."""
-        problem, settled = with_mount_estimated(*self, prior, progress, _LAST_PASSES)
+    def with_mount_estimated(self, prior: StartPrior, progress: Progress) -> tuple[_Solved, MountError | None]:
+        """Return it with the mount of the IMU as the other sensors have it, and what that says of it."""
+        problem, settled, error = with_mount_estimated(*self, prior, progress, _LAST_PASSES)
         if settled is self.settled:
-            return self
+            return self, error
         passes, iterations = (getattr(self.settled, key) + getattr(settled, key) for key in ("passes", "iterations"))
-        return _Solved(problem, replace(settled, passes=passes, iterations=iterations))
+        return _Solved(problem, replace(settled, passes=passes, iterations=iterations)), error
 
     def choice(self) -> _Choice:
         return _Choice(self.problem, self.settled.values, self.settled.verdicts)

@@ -23,9 +23,8 @@ import numpy as np
 
 from graphloc.build import CONSTANT_TAILS, Problem, StartPrior, with_imu_turned
 from graphloc.errors import SolveError
-from graphloc.frames import Array
+from graphloc.frames import Array, skew
 from graphloc.recording import Progress
-from graphloc.solve._covariances import world_covariance
 from graphloc.solve._decide import Stage, weigh
 from graphloc.solve._linearised import normal_solver, sparse_rows
 from graphloc.solve._passes import Settled, cost_as_configured, settle
@@ -53,9 +52,9 @@ class MountError(NamedTuple):
         Args:
             R: (N, 3, 3) attitudes. lever_m: (3,) the point from the IMU, body axes.
         """
-        return np.array([
-            world_covariance(by @ self._beyond() @ by.T, turn, lever_m) for by, turn in zip(self.pose, R, strict=True)
-        ])  # fmt: skip
+        turned, moved = R @ self.pose[:, :3], R @ (self.pose[:, 3:] - skew(lever_m) @ self.pose[:, :3])
+        by = np.concatenate([moved, turned], axis=1)
+        return np.asarray(by @ self._beyond() @ by.transpose(0, 2, 1))
 
     def velocity_covariance(self) -> Array:
         """Return what it adds to the covariance (N, 3, 3) of the velocity, world axes."""
@@ -100,8 +99,11 @@ def mount_error(problem: Problem, graph: gtsam.NonlinearFactorGraph, values: gts
 
 def with_mount_estimated(
     problem: Problem, settled: Settled, prior: StartPrior, progress: Progress, most: int
-) -> tuple[Problem, Settled]:
-    """Return the problem with the mount of its IMU as is most probable, settled in at most `most` passes; as they are if that is near."""
+) -> tuple[Problem, Settled, MountError | None]:
+    """Return the problem with the mount of its IMU as is most probable, settled in at most `most` passes; as they are if that is near.
+
+    And what that says of the mount; None where it is taken as given, or not determined.
+    """
     last = len(problem.timeline) - 1
 
     def cost(problem: Problem, settled: Settled) -> float:
@@ -109,22 +111,26 @@ def with_mount_estimated(
         off = 0.5 * CONSTANT_TAILS * float(np.log1p(squares / CONSTANT_TAILS))
         return off + cost_as_configured(problem, settled.values, 0, last, prior, judged=last)
 
-    lowest = None
-    for _ in range(_ROUNDS):
+    def found(problem: Problem, settled: Settled) -> MountError | None:
         try:
-            found = mount_error(problem, settled.graph, settled.values)
+            return mount_error(problem, settled.graph, settled.values)
         except (RuntimeError, np.linalg.LinAlgError):
+            return None
+
+    error, lowest = found(problem, settled), np.inf
+    for _ in range(_ROUNDS):
+        if error is None or float(np.abs(error.turn_rad).max()) < _MATTERS * mount_sigma_rad(problem):
             break
-        if found is None or float(np.abs(found.turn_rad).max()) < _MATTERS * mount_sigma_rad(problem):
-            break
-        lowest = cost(problem, settled) if lowest is None else lowest
-        turned = with_imu_turned(problem, settled.values, found.turn_rad)
+        if np.isinf(lowest):
+            lowest = cost(problem, settled)
+        turned = with_imu_turned(problem, settled.values, error.turn_rad)
         verdicts = weigh(turned, settled.values, first=0, last=last, stage=Stage.FINAL)
         try:
             again = settle(turned, settled.values, verdicts, prior, progress, most)
         except SolveError:
             break
-        if (now := cost(turned, again)) >= lowest:
+        if not (now := cost(turned, again)) < lowest:
             break
         problem, settled, lowest = turned, again, now
-    return problem, settled
+        error = found(problem, settled)
+    return problem, settled, error
