@@ -42,7 +42,7 @@ def estimate_of(
     Args:
         agreed_ns: stamp at which each absolute sensor last agreed. absolute: names of all absolute sensors.
         doubt: why the health cannot be good, or empty.
-        unmodelled: what slow errors that are left out do to the newest state; the covariances then include it.
+        unmodelled: what slow errors that are left out, and the IMU's mount, do to the newest state; the covariances then include it.
         heading_off_rad: by how much the motion shows the heading to be off; the covariance then includes it.
         heading_var: of the heading, rad^2, where no sensor measures it and the window's own covariance is too sure; else 0.
         guess: whether the heading is a guess.
@@ -55,7 +55,7 @@ def estimate_of(
     cov[:3, :3] += unmodelled_covariance(list(problem.streams.values()))
     v_cov = now.velocity_cov
     if unmodelled is not None:
-        cov[3:, 3:] += unmodelled.rotation
+        cov += unmodelled.pose(R @ lever)
         v_cov = v_cov + unmodelled.velocity
     others_m, others_cov = lag.others
     cov[:3, :3] += others_cov

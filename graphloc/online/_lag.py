@@ -26,12 +26,11 @@ from graphloc.online._entries import Entries
 from graphloc.online._judge import Judge
 from graphloc.online._live import LiveProblem
 from graphloc.online._states import Newest, States
-from graphloc.online._unmodelled import UnmodelledError, estimated_beside
+from graphloc.online._unmodelled import BeforeStart, ErrorSizes, UnmodelledError, estimated_beside
 from graphloc.online._window import Window
 from graphloc.position_jumps import why_in_doubt
 from graphloc.solve._decide import AGREES
 from graphloc.solve._imu_noise import log_likelihood
-from graphloc.solve._unmodelled import Unmodelled
 from graphloc.solve._warnings import noisier_warning
 
 # Of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10.
@@ -131,18 +130,19 @@ class Lag:
         self._states.read()
 
     def follow(self, unmodelled: UnmodelledError) -> None:
-        """Bring what left-out slow errors do to the newest state up to date with it."""
+        """Bring what left-out slow errors and the IMU's mount do to the newest state up to date with it."""
+        if not unmodelled.due(self.newest.stamp_ns):
+            return
         told = {}
         for name, stream in self.problem.streams.items():
             told[name] = self._entries.information(stream, self._followed.get(name, 0))
             self._followed[name] = len(stream.measurements)
         unmodelled.advance(self.newest, self.problem.links, told)
 
-    def unmodelled(self, attitude: Unmodelled | None = None, cov: Array | None = None) -> UnmodelledError | None:
-        """Return what left-out slow errors do to the newest state, as known from elsewhere (see `UnmodelledError.at`)."""
-        streams = self.problem.streams
-        P = self._states.covariance([stream for stream, _ in estimated_beside(streams)])
-        return UnmodelledError.at(streams, self.newest, P, attitude, cov)
+    def unmodelled(self, begun: BeforeStart | None = None, last: ErrorSizes | None = None) -> UnmodelledError | None:
+        """Return what left-out slow errors and the IMU's mount do to the newest state, as known from elsewhere (see `UnmodelledError.at`)."""
+        P = self._states.covariance([stream for stream, _ in estimated_beside(self.problem.streams)])
+        return UnmodelledError.at(self.problem, self.newest, P, begun, last)
 
     def anchor(self) -> Anchor:
         """Return the anchor at the newest state, to rebuild or resume from."""

@@ -226,13 +226,14 @@ class LiveStream:
 
 @dataclass(slots=True, eq=False)
 class LiveProblem:
-    """What `attach` needs, and the IMU. `t_body_imu_m` (3,), `R_body_imu` (3, 3): mount of the IMU in body."""
+    """What `attach` needs, and the IMU. `t_body_imu_m` (3,), `R_body_imu` (3, 3): mount of the IMU in body, and how far it may be off."""
 
     config: VesselConfig
     datum: Datum
     timeline: LiveTimeline
     t_body_imu_m: Array
     R_body_imu: Array
+    imu_mount_sigma_rad: float
     links: InertialLink
     streams: dict[str, LiveStream]
     motion_model: MotionModel
@@ -317,6 +318,7 @@ def live_problem(
         timeline=LiveTimeline(config.timeline, start_ns, jumps_ns),
         t_body_imu_m=t,
         R_body_imu=R,
+        imu_mount_sigma_rad=imu_config.mount_sigma_rad,
         links=setup.inertial.link(imu, imu_config, R, datum.gravity_mps2, noise_scale),
         streams=streams,
         motion_model=motion_model,

@@ -36,7 +36,7 @@ class PersistentState:
         motion_model: motion model. heading_check: whether the heading fits the motion.
         receivers: detectors of what a receiver repeats, and of its position jumps, by sensor.
         frozen: receivers that were last reported as frozen.
-        unmodelled: what slow errors that are left out do to the newest state; None where none is left out.
+        unmodelled: what slow errors that are left out, and the IMU's mount, do to the newest state; None where there is nothing of that.
     """
 
     datum: Datum | None
@@ -96,7 +96,7 @@ class PersistentState:
             heading=self.heading,
             p_odom_m=self.odometry.p_m,
             R_odom_body=self.odometry.R,
-            unmodelled=None if self.unmodelled is None else self.unmodelled.cov,
+            unmodelled=None if self.unmodelled is None else self.unmodelled.sizes,
         )
 
     def forget_receivers(self) -> None:

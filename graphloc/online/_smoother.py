@@ -344,7 +344,7 @@ class OnlineSmoother:
         solved = (started.pose, started.velocity, started.bias)
         self._tracking = tracking = Tracking(self._setup, persistent, self._ledger, started.anchor, samples, solved)
         self._ledger.enter(started.rows)
-        persistent.unmodelled = tracking.lag.unmodelled(started.unmodelled)
+        persistent.unmodelled = tracking.lag.unmodelled(started.before)
         tracking.catch_up(started.anchor, samples, others, until_ns)
         self._keep_anchor(tracking)
         newest_ns = tracking.lag.newest.stamp_ns
@@ -411,7 +411,7 @@ class OnlineSmoother:
         )
         try:
             tracking = Tracking(self._setup, persistent, self._ledger, found.anchor, [found.imu, newest])
-            persistent.unmodelled = tracking.lag.unmodelled(cov=found.unmodelled)
+            persistent.unmodelled = tracking.lag.unmodelled(last=found.unmodelled)
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             self._say(f"the snapshot cannot be used ({in_one_line(error)}): starts without it")
             return

@@ -15,9 +15,10 @@ from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import ImuSample
 from graphloc.online._anchor import Anchor
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
+from graphloc.online._unmodelled import ErrorSizes
 from graphloc.solve._batch import LARGEST_NOISE_SCALE
 
-_VERSION = 6
+_VERSION = 7
 _EVERY_S = 2.0
 _MOST_TIMES = 1e4  # of a data sheet's noise, that an IMU on any engine has
 
@@ -33,7 +34,7 @@ class Snapshot:
             and on that of the accelerometer. sensor_noise: those of other sensors' sigmas (`SensorNoise.times`).
         heading: where no sensor measures it, how far it may be off.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
-        unmodelled: covariance of `UnmodelledError`; None where no slow error is left out.
+        unmodelled: sizes of `UnmodelledError`; None where no slow error is left out, and the IMU's mount is right.
     """
 
     vessel: str
@@ -47,7 +48,7 @@ class Snapshot:
     heading: UnmeasuredHeading | None
     p_odom_m: Array
     R_odom_body: Array
-    unmodelled: Array | None
+    unmodelled: ErrorSizes | None
 
     def write(self, path: Path) -> None:
         """Replace the file atomically: a kill leaves the old one or the new one.
@@ -67,7 +68,7 @@ class Snapshot:
             "heading": None if self.heading is None else asdict(self.heading),
             "agreed_ns": dict(self.agreed_ns),
             "odom": [self.p_odom_m.tolist(), self.R_odom_body.tolist()],
-            "unmodelled": None if self.unmodelled is None else self.unmodelled.tolist(),
+            "unmodelled": None if self.unmodelled is None else [of.tolist() for of in self.unmodelled],
         }
         part = path.with_name(path.name + ".part")
         with part.open("w", encoding="utf-8") as stream:
@@ -93,7 +94,7 @@ class Snapshot:
             str(name): {str(key): float(by) for key, by in times.items()} for name, times in raw["sensor_noise"].items()
         }
         datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
-        unmodelled = None if raw["unmodelled"] is None else np.array(raw["unmodelled"], dtype=np.float64)
+        sizes = [np.array(of, dtype=np.float64) for of in raw["unmodelled"] or ()]
         heading = None if raw["heading"] is None else UnmeasuredHeading(**raw["heading"])
         raised = [scale, gyro, accel, *(by for times in sensor_noise.values() for by in times.values())]
         numbers = np.concatenate(
@@ -103,7 +104,7 @@ class Snapshot:
                 datum.origin,
                 list(heights_m.values()),
                 raised,
-                [] if unmodelled is None else unmodelled.ravel(),
+                *(of.ravel() for of in sizes),
                 [] if heading is None else [heading.since_ns, heading.sigma_rad, heading.drift_radps],
             ]
         )
@@ -122,7 +123,7 @@ class Snapshot:
             heading=heading,
             p_odom_m=p,
             R_odom_body=R,
-            unmodelled=unmodelled,
+            unmodelled=ErrorSizes(*sizes) if sizes else None,
         )
 
 

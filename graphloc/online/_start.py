@@ -23,11 +23,13 @@ from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._setup import Setup
 from graphloc.online._unmeasured_heading import DOUBTFUL_RAD, UnmeasuredHeading
+from graphloc.online._unmodelled import BeforeStart
 from graphloc.recording import Recording
 from graphloc.solve._align import wanted_travel_m
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult, solve_batch
 from graphloc.solve._covariances import ANY_HEADING_RAD, world_covariance
 from graphloc.solve._decide import AGREES, decisions
+from graphloc.solve._imu_mount import mount_error
 from graphloc.solve._ledger import row_of
 from graphloc.solve._stretch import StretchStep, past_at
 from graphloc.solve._unmodelled import Unmodelled, unmodelled
@@ -56,7 +58,7 @@ class Started:
         heading: where no sensor measures it, how far it may be off; None: one does, or the motion told it.
         noise_scale: factor on the IMU noise. gyro_noise, accel_noise: beside it, on that of each.
         sensor_noise: factors on sigmas of other sensors, by sensor and key of its configuration.
-        unmodelled: what slow errors that are left out did to that state; None: nothing that is known.
+        before: what slow errors that are left out, and the IMU's mount, did to that state; None: nothing that is known.
         notes: what the alignment was based on. warnings: on noise that is taken to be larger than configured. rows: ledger rows of what was measured before the first state.
     """
 
@@ -71,7 +73,7 @@ class Started:
     gyro_noise: float
     accel_noise: float
     sensor_noise: Mapping[str, Mapping[str, float]]
-    unmodelled: Unmodelled | None
+    before: BeforeStart | None
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
     rows: tuple[LedgerRow, ...]
@@ -168,7 +170,7 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
         gyro_noise=taken_imu.gyro_noise_radps / imu.gyro_noise_radps,
         accel_noise=taken_imu.accel_noise_mps2 / imu.accel_noise_mps2,
         sensor_noise={stream.name: taken[stream.name].sigmas_over(stated[stream.name]) for stream in problem.streams},
-        unmodelled=_unmodelled(result, k),
+        before=_before(result, k),
         notes=result.notes,
         warnings=tuple(noise_warnings(problem, result)),
         rows=tuple(before),
@@ -227,13 +229,16 @@ def _vertical_bias_sigma(R_body_imu: Array, result: BatchResult) -> float:
     return float(np.sqrt(up @ result.prior.bias_cov[3:, 3:] @ up))
 
 
-def _unmodelled(result: BatchResult, k: int) -> Unmodelled | None:
-    """Return what left-out slow errors did to state `k`, the first of the window; at the first data nothing has done anything yet."""
-    try:
-        found = unmodelled(result) if k else None
-    except RuntimeError:  # not determined; the window that follows says what it can
+def _before(result: BatchResult, k: int) -> BeforeStart | None:
+    """Return what was done to state `k`, the first of the window; at the first data nothing has been done yet."""
+    if not k:
         return None
-    return None if found is None else Unmodelled(found.rotation[k], found.velocity[k])
+    try:
+        slow, mount = unmodelled(result), mount_error(result.problem, result.graph, result.values)
+    except (RuntimeError, np.linalg.LinAlgError):  # not determined; the window that follows says what it can
+        return None
+    by_mount = None if mount is None else mount.in_world(result.values.atPose3(keys.pose(k)).rotation().matrix(), k)
+    return BeforeStart(None if slow is None else Unmodelled(slow.rotation[k], slow.velocity[k]), by_mount)
 
 
 def _anchor(result: BatchResult, lag_s: float) -> tuple[int, Anchor]:

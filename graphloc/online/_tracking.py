@@ -193,7 +193,7 @@ class Tracking:
         self._ledger.enter(lag.gone())
 
     def _follow_unmodelled(self) -> None:
-        """Bring what left-out slow errors do to the newest state up to date; where that fails, they do what they did before.
+        """Bring what left-out slow errors and the IMU's mount do to the newest state up to date; where that fails, they do what they did before.
 
         It is only about bounds: a window that is right must not be given up for it.
         """
@@ -203,8 +203,11 @@ class Tracking:
         try:
             lag.follow(unmodelled)
         except Exception as error:  # noqa: BLE001 - whatever went wrong in there, the vessel still needs a pose
-            log.warning("online: what slow errors do to heading and velocity is not up to date: %s", in_one_line(error))
-            self._persistent.unmodelled = lag.unmodelled(cov=unmodelled.cov)
+            log.warning(
+                "online: what slow errors and the IMU's mount do to heading and velocity is not up to date: %s",
+                in_one_line(error),
+            )
+            self._persistent.unmodelled = lag.unmodelled(last=unmodelled.sizes)
 
     def _read_imu(self) -> None:
         """Hand the samples that have arrived to the window; where they came late, integrate anew."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the slow errors that are left out of the window (`LiveStream.left_out`) do to its newest state.
+"""What the slow errors that are left out of the window (`LiveStream.left_out`), and a mount of the IMU that is off, do to its newest state.
 
 Nothing tells such an error d from motion, so the estimate follows it: in position by all of it, in heading and velocity by as
 much as the IMU lets it. Its covariance is that of a consider parameter (Schmidt 1966) of the filter that the newest state is:
@@ -7,10 +7,13 @@ with F, Q from one state to the next, J the information of all measurements sinc
 
     P+ = ((F P F' + Q)^-1 + J)^-1,    e+ = (1 - P+ J) F e + P+ J_p d
 
+An IMU whose mount is turned by m, body axes, measures the motion of a body that is turned as much, U m, and the sensors that of the
+body; so that does e+ = (1 - P+ J) (F (e + U m) - U+ m) to it, which is linear in m.
+
 The state has the slow errors of the other sensors with it: a compass whose mount offset is unknown holds a heading for a while,
 but does not tell it. P is computed here, not taken from the window: that is linearised anew now and then, and judges older
 measurements again, which its covariances of two states do not tell from what was measured between them. Offline:
-`graphloc.solve._unmodelled`. Not handled: what comes late counts as measured at the newest state; the motion model
+`graphloc.solve._unmodelled`, `_imu_mount`, where m is estimated, too. Not handled: what comes late counts as measured at the newest state; the motion model
 (after 100 s without fixes the errors are up to 15 % larger for it).
 """
 
@@ -18,66 +21,110 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
 from graphloc import keys
-from graphloc.frames import Array
+from graphloc.frames import Array, skew
 from graphloc.graph import Going, InertialLink, SlowProcess
 from graphloc.online._anchor import in_world, sound
-from graphloc.online._live import LiveStream
+from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import Newest
 from graphloc.solve._unmodelled import Unmodelled
+from graphloc.time import NS_PER_S
 
 _ROTATION, _POSITION, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 _CORE = 15  # rotation, position, velocity, bias
+_MOUNT_EVERY_S = 0.5
+
+
+class BeforeStart(NamedTuple):
+    """What has been done to the first state of a window before it: by left-out errors; and (9, 3) rotation, position and velocity per turn of the mount."""
+
+    slow: Unmodelled | None
+    by_mount: Array | None
+
+
+class ErrorSizes(NamedTuple):
+    """`cov` and `by_mount` of an `UnmodelledError`."""
+
+    cov: Array
+    by_mount: Array
+
+    def fits(self, other: ErrorSizes) -> bool:
+        """Whether it is finite, and as large as the other one."""
+        same = all(a.shape == b.shape for a, b in zip(self, other, strict=True))
+        return same and all(bool(np.isfinite(a).all()) for a in self)
 
 
 @dataclass(slots=True, eq=False)
 class UnmodelledError:
-    """What the left-out errors of some receivers do to the newest state.
+    """What the left-out errors of some receivers, and the mount of the IMU, do to the newest state.
 
     Attributes:
         left_out: their processes, by receiver. estimated: those of the slow errors that the window estimates, by sensor.
         cov: (n + 3 m, n + 3 m) of e (rotation, position, velocity in axes of world; bias; slow errors that are estimated) and of the m
             errors (east, north, up).
+        by_mount: (n, 3) change of e per turn of the IMU's mount, body axes. mount_sigma_rad: of it, each axis.
         newest: the state that it is of. P: (n, n), covariance of that state without the errors, axes as of e.
     """
 
     left_out: Mapping[str, SlowProcess]
     estimated: Mapping[str, SlowProcess]
     cov: Array
+    by_mount: Array
+    mount_sigma_rad: float
     newest: Newest
     P: Array
 
     @classmethod
     def at(
-        cls, streams: Mapping[str, LiveStream], newest: Newest, P: Array, attitude: Unmodelled | None, cov: Array | None
+        cls, problem: LiveProblem, newest: Newest, P: Array, begun: BeforeStart | None, last: ErrorSizes | None
     ) -> UnmodelledError | None:
-        """Return that of the first state of a window, where the position is off by all of the errors; None where no stream leaves any out.
+        """Return that of the first state of a window, where the position is off by all of the errors; None where there is nothing of that.
 
         Args:
-            newest, P: that state. attitude: what the errors have done to attitude and velocity before it; None: nothing.
-            cov: `cov` as it was last, taken where it has the size for these streams; None: not known.
+            newest, P: that state. begun: what has been done to it before; None: nothing. last: as it was last, taken where it has the
+                size for these streams; None: not known.
         """
+        streams = problem.streams
         left_out = {name: stream.left_out for name, stream in streams.items() if stream.left_out is not None}
-        if not left_out:
+        mount_sigma_rad = problem.imu_mount_sigma_rad
+        if not left_out and mount_sigma_rad == 0.0:
             return None
         estimated = {stream.name: slow for stream, slow in estimated_beside(streams)}
         n, m = len(P), len(left_out)
         of_errors = np.vstack([np.zeros((n, 3 * m)), np.eye(3 * m)])
-        of_errors[_POSITION] = np.hstack([np.eye(3)] * m)
-        begun = of_errors @ np.diag(np.concatenate([s.sigma**2 for s in left_out.values()])) @ of_errors.T
-        if attitude is not None:
-            # Beside a heading that is off, the offset of a compass that agrees with it is off too.
-            turned = np.vstack([np.eye(3), np.linalg.solve(P[_ROTATION, _ROTATION], P[_ROTATION, _CORE:]).T])
-            rows = np.r_[_ROTATION, _CORE:n]
-            begun[np.ix_(rows, rows)] += turned @ attitude.rotation @ turned.T
-            begun[_VELOCITY, _VELOCITY] += attitude.velocity
-        if cov is None or cov.shape != begun.shape or not np.isfinite(cov).all():
-            cov = begun
-        return cls(left_out, estimated, cov, newest, P)
+        of_errors[_POSITION] = np.tile(np.eye(3), m)
+        sigma = np.concatenate([np.zeros(0), *(slow.sigma for slow in left_out.values())])
+        cov = of_errors @ np.diag(sigma**2) @ of_errors.T
+        # Beside a heading that is off, the offset of a compass that agrees with it is off too.
+        turned, rows = (
+            np.vstack([np.eye(3), np.linalg.solve(P[_ROTATION, _ROTATION], P[_ROTATION, _CORE:]).T]),
+            np.r_[_ROTATION, _CORE:n],
+        )
+        by_mount = np.zeros((n, 3))
+        if begun is not None and begun.slow is not None:
+            cov[np.ix_(rows, rows)] += turned @ begun.slow.rotation @ turned.T
+            cov[_VELOCITY, _VELOCITY] += begun.slow.velocity
+        if begun is not None and begun.by_mount is not None:
+            by_mount[rows] = turned @ begun.by_mount[_ROTATION]
+            by_mount[3:9] = begun.by_mount[3:]
+        sizes = ErrorSizes(cov, by_mount)
+        if last is not None and last.fits(sizes):
+            sizes = last
+        return cls(left_out, estimated, *sizes, mount_sigma_rad, newest, P)
+
+    @property
+    def sizes(self) -> ErrorSizes:
+        """What a window that takes over from this one needs."""
+        return ErrorSizes(self.cov, self.by_mount)
+
+    def due(self, stamp_ns: int) -> bool:
+        """Whether it must be brought up to a stamp: what a mount does changes slowly."""
+        return bool(self.left_out) or stamp_ns - self.newest.stamp_ns >= _MOUNT_EVERY_S * NS_PER_S
 
     def advance(self, newest: Newest, links: InertialLink, told: Mapping[str, Array]) -> None:
         """Follow the window to its newest state; nothing where that is not newer than the last (a window that was rebuilt).
@@ -105,6 +152,11 @@ class UnmodelledError:
             J[np.ix_(rows, rows)] += information
         kept = np.linalg.inv(np.eye(n) + predicted @ J)  # 1 - P+ J
         P = sound(kept @ predicted)
+        turned = self.by_mount.copy()
+        turned[_ROTATION] += self.newest.pose.rotation().matrix()
+        turned = F @ turned
+        turned[_ROTATION] -= newest.pose.rotation().matrix()
+        by_mount = kept @ turned
         # The errors move on first, and the state then follows them.
         decay, walk = _walks(self.left_out.values(), dt_s)
         on = np.zeros_like(self.cov)
@@ -112,21 +164,31 @@ class UnmodelledError:
         cov = on @ self.cov @ on.T
         cov[n:, n:] += walk
         follow = np.eye(len(cov))
-        follow[:n, n:] = np.hstack([P[:, :9] @ told[name][:9, _POSITION] for name in self.left_out])
+        follow[:n, n:] = np.hstack(
+            [np.zeros((n, 0)), *(P[:, :9] @ told[name][:9, _POSITION] for name in self.left_out)]
+        )
         cov = follow @ cov @ follow.T
-        if not (np.isfinite(P).all() and np.isfinite(cov).all()):
+        if not (np.isfinite(P).all() and np.isfinite(cov).all() and np.isfinite(by_mount).all()):
             raise ArithmeticError("what slow errors do to the newest state is not finite")
-        self.newest, self.P, self.cov = newest, P, 0.5 * (cov + cov.T)
+        self.newest, self.P, self.cov, self.by_mount = newest, P, 0.5 * (cov + cov.T), by_mount
 
-    @property
-    def rotation(self) -> Array:
-        """Covariance (3, 3) that comes on top of the rotation's, rad^2, in axes of world."""
-        return self.cov[_ROTATION, _ROTATION]
+    def pose(self, lever_m: Array) -> Array:
+        """Return the covariance (6, 6) that comes on top of that of the place of a point of the body, and of the attitude, in axes of world.
+
+        Args:
+            lever_m: (3,) the point from the IMU, axes of world. Of its place without the left-out errors.
+        """
+        turned = self.by_mount[_ROTATION]
+        by = np.vstack([self.by_mount[_POSITION] - skew(lever_m) @ turned, turned])
+        cov = self.mount_sigma_rad**2 * by @ by.T
+        cov[3:, 3:] += self.cov[_ROTATION, _ROTATION]
+        return cov
 
     @property
     def velocity(self) -> Array:
-        """Likewise of the velocity (3, 3), m^2/s^2."""
-        return self.cov[_VELOCITY, _VELOCITY]
+        """Covariance (3, 3) that comes on top of the velocity's, m^2/s^2."""
+        by = self.by_mount[_VELOCITY]
+        return np.asarray(self.cov[_VELOCITY, _VELOCITY] + self.mount_sigma_rad**2 * by @ by.T)
 
 
 def estimated_beside(streams: Mapping[str, LiveStream]) -> list[tuple[LiveStream, SlowProcess]]:

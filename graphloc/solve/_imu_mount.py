@@ -56,6 +56,10 @@ class MountError(NamedTuple):
         by = np.concatenate([moved, turned], axis=1)
         return np.asarray(by @ self._beyond() @ by.transpose(0, 2, 1))
 
+    def in_world(self, R: Array, k: int) -> Array:
+        """Return the change (9, 3) of rotation, place and velocity of state k per turn, in axes of world; R: (3, 3) its attitude."""
+        return np.vstack([R @ self.pose[k, :3], R @ self.pose[k, 3:], self.velocity[k]])
+
     def velocity_covariance(self) -> Array:
         """Return what it adds to the covariance (N, 3, 3) of the velocity, world axes."""
         return np.asarray(self.velocity @ self._beyond() @ self.velocity.transpose(0, 2, 1))
