@@ -234,7 +234,10 @@ def _before(result: BatchResult, k: int) -> BeforeStart | None:
     if not k:
         return None
     try:
-        slow, mount = unmodelled(result), mount_error(result.problem, result.graph, result.values)
+        slow, mount = (
+            unmodelled(result),
+            mount_error(result.problem, result.graph, result.values, result.verdicts, result.prior),
+        )
     except (RuntimeError, np.linalg.LinAlgError):  # not determined; the window that follows says what it can
         return None
     by_mount = None if mount is None else mount.in_world(result.values.atPose3(keys.pose(k)).rotation().matrix(), k)

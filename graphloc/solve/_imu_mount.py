@@ -16,17 +16,18 @@ of centimetres tell the heading of an IMU to some tenths of a degree, and state 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
+from scipy.sparse import diags_array
 
 from graphloc.build import CONSTANT_TAILS, Problem, StartPrior, with_imu_turned
 from graphloc.errors import SolveError
 from graphloc.frames import Array, skew
 from graphloc.recording import Progress
-from graphloc.solve._decide import Stage, weigh
-from graphloc.solve._linearised import normal_solver, sparse_rows
+from graphloc.solve._decide import Stage, Verdicts, weigh
+from graphloc.solve._linearised import linearised, normal_solver, root_weights, sparse_rows, with_left_out
 from graphloc.solve._passes import Settled, cost_as_configured, settle
 
 _ROUNDS = 3
@@ -74,8 +75,13 @@ def mount_sigma_rad(problem: Problem) -> float:
     return float(problem.config.sensors[problem.imu.sensor].mount_sigma_rad)
 
 
-def mount_error(problem: Problem, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> MountError | None:
-    """Return what a solved graph says of the mount of the IMU; None where it is taken as given.
+def mount_error(
+    problem: Problem, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, verdicts: Verdicts, prior: StartPrior
+) -> MountError | None:
+    """Return what a solved run says of the mount of the IMU; None where it is taken as given.
+
+    Args:
+        graph, values, verdicts, prior: of the solution.
 
     Raises:
         RuntimeError, numpy.linalg.LinAlgError: a state is not determined.
@@ -84,21 +90,41 @@ def mount_error(problem: Problem, graph: gtsam.NonlinearFactorGraph, values: gts
     if sigma == 0.0:
         return None
     n = len(problem.timeline)
-    J, b = sparse_rows(graph, values)
-    first_pose = J.shape[1] - 6 * n  # keys are sorted by letter: poses come last, before them velocities
-    U = np.zeros((J.shape[1], 3))
-    U[first_pose:].reshape(n, 6, 3)[:, :3] = np.eye(3)
-    c = J @ U
-    c[9 * (n - 1) :] = 0.0  # factors of the IMU come first
-    solve = normal_solver(J)
-    X = -solve(J.T @ c)
-    left = c + J @ X
+    told = follows = _followed(*sparse_rows(graph, values), n)
+    if any(stream.left_out is not None for stream in problem.streams):
+        # The graph takes their drift for motion, which would speak for a mount as if it were none.
+        rows = linearised(*with_left_out(problem, values), verdicts, prior)
+        root = root_weights(rows, -rows.b)
+        told = _followed(diags_array(root) @ rows.J, root * rows.b, n)
     var = sigma**2 * (1.0 + (problem.imu_turn_rad / sigma) ** 2 / CONSTANT_TAILS)
-    cov = np.linalg.inv(left.T @ left + np.diag(1.0 / var))
-    turn = cov @ (left.T @ b - problem.imu_turn_rad / var)
+    cov: Array = np.linalg.inv(told.left.T @ told.left + np.diag(1.0 / var))
+    turn = cov @ (told.left.T @ told.b - problem.imu_turn_rad / var)
+    X = follows.states
     if not (np.isfinite(cov).all() and np.isfinite(X).all()):
         raise RuntimeError("not finite")
-    return MountError(turn, cov, X[first_pose:].reshape(n, 6, 3), X[first_pose - 3 * n : first_pose].reshape(n, 3, 3))
+    first_velocity, first_pose = (
+        len(X) - 9 * n,
+        len(X) - 6 * n,
+    )  # keys are sorted by letter: velocities and poses come last
+    return MountError(turn, cov, X[first_pose:].reshape(n, 6, 3), X[first_velocity:first_pose].reshape(n, 3, 3))
+
+
+class _Followed(NamedTuple):
+    """How the states (columns, 3) of a linear system follow the turn, what is left in its rows (rows, 3), and these rows' b."""
+
+    states: Array
+    left: Array
+    b: Array
+
+
+def _followed(J: Any, b: Array, n: int) -> _Followed:
+    """Return how the states follow; the factors of the IMU between the n of them come first in J (rows, columns)."""
+    U = np.zeros((J.shape[1], 3))
+    U[-6 * n :].reshape(n, 6, 3)[:, :3] = np.eye(3)
+    c = J @ U
+    c[9 * (n - 1) :] = 0.0
+    X = -normal_solver(J)(J.T @ c)
+    return _Followed(X, c + J @ X, b)
 
 
 def with_mount_estimated(
@@ -117,7 +143,7 @@ def with_mount_estimated(
 
     def found(problem: Problem, settled: Settled) -> MountError | None:
         try:
-            return mount_error(problem, settled.graph, settled.values)
+            return mount_error(problem, settled.graph, settled.values, settled.verdicts, prior)
         except (RuntimeError, np.linalg.LinAlgError):
             return None
 

@@ -101,6 +101,19 @@ def linearised(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior
     return Rows(J=J, b=b, states=last + 1, starts=starts, stamps_ns=stamps, made=made, kernels=kernels)
 
 
+def with_left_out(problem: Problem, values: gtsam.Values) -> tuple[Problem, gtsam.Values]:
+    """Return the problem with the slow errors that were left out as states, and a copy of the values with them at zero."""
+    values, streams = gtsam.Values(values), []
+    for stream in problem.streams:
+        if (slow := stream.left_out) is not None:
+            for j in range(len(problem.timeline.slow_stamps_ns)):
+                key, zero = keys.slow(stream.number, j), np.zeros(len(slow.sigma))
+                values.update(key, zero) if values.exists(key) else values.insert(key, zero)
+            stream = replace(stream, slow=slow, left_out=None)
+        streams.append(stream)
+    return replace(problem, streams=tuple(streams)), values
+
+
 def sparse_rows(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[Any, Array]:
     """Return J (rows, columns), sparse, and b (rows,) of a graph linearised at `values`, whitened, with its losses."""
     row, column, entry = np.asarray(graph.linearize(values).sparseJacobian_())

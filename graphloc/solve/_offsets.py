@@ -25,13 +25,13 @@ import numpy as np
 from scipy.sparse import diags_array
 
 from graphloc import keys
-from graphloc.build import Problem, Stream
+from graphloc.build import Problem, Stream, with_imu_turned
 from graphloc.frames import Array
 from graphloc.graph import Constant, SlowProcess
 from graphloc.offsets import Offset, Offsets, Probe
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._imu_noise import imu_misfit
-from graphloc.solve._linearised import Rows, linearised, normal_solver, root_weights
+from graphloc.solve._linearised import Rows, linearised, normal_solver, root_weights, with_left_out
 
 BLOCK_S = 2.0
 # Rounds of choosing weights; they end early where the weights, or theta (in sigmas), change little.
@@ -111,18 +111,16 @@ def _in_blocks(rows: Rows, left: Array, r: Array) -> tuple[Array, Array]:
 
 
 def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values]:
-    """Return the problem without mount offsets that are states already, and with the slow errors that were left out."""
-    problem, values = result.problem, gtsam.Values(result.values)
+    """Return the problem without mount offsets that are states already, that of the IMU among them, and with the slow errors that were left out."""
+    problem, values = with_left_out(result.problem, result.values)
+    if problem.imu_turn_rad.any():
+        problem = with_imu_turned(problem, values, -problem.imu_turn_rad)
     streams = []
     for stream in problem.streams:
-        slow, left_out = stream.slow, stream.left_out
+        slow = stream.slow
         if slow is not None and any(slow.constant & (np.array(slow.axes) == "yaw")):
             slow = _without_mount(problem, stream, slow, values)
-        if left_out is not None:
-            slow = left_out
-            for j in range(len(problem.timeline.slow_stamps_ns)):
-                values.insert(keys.slow(stream.number, j), np.zeros(len(slow.sigma)))
-        streams.append(replace(stream, slow=slow, left_out=None, constants=_surveyed(stream)))
+        streams.append(replace(stream, slow=slow, constants=_surveyed(stream)))
     return replace(problem, streams=tuple(streams)), values
 
 

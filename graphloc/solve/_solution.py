@@ -126,7 +126,7 @@ def _add_mount(result: BatchResult, R: Array, cov: Array, v_cov: Array) -> list[
     """Add what is not known of the IMU's mount; return a warning where that fails, or where the mount is far from what is configured."""
     problem = result.problem
     try:
-        found = result.mount or mount_error(problem, result.graph, result.values)
+        found = result.mount or mount_error(problem, result.graph, result.values, result.verdicts, result.prior)
     except (RuntimeError, np.linalg.LinAlgError, MemoryError) as error:
         return [f"the bounds do not include that the IMU's mount may be off ({in_one_line(error)})"]
     if found is None:
