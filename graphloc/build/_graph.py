@@ -37,6 +37,10 @@ class Level:
     bias: Array
     sigma_rad: float
 
+    def turned(self, turn: Array) -> Level:
+        """Return it as measured by an IMU whose mount is turned by a rotation (3, 3), body axes."""
+        return replace(self, up=turn @ self.up, by_bias=turn @ self.by_bias)
+
     def error(self, R: Array, bias: Array) -> tuple[Array, Array, Array]:
         """Return the horizontal part (2,) of `up` in world, in sigmas, and its Jacobians.
 

@@ -29,7 +29,7 @@ from graphloc.solve._align import wanted_travel_m
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult, solve_batch
 from graphloc.solve._covariances import ANY_HEADING_RAD, world_covariance
 from graphloc.solve._decide import AGREES, decisions
-from graphloc.solve._imu_mount import mount_error
+from graphloc.solve._imu_mount import followed_before
 from graphloc.solve._ledger import row_of
 from graphloc.solve._stretch import StretchStep, past_at
 from graphloc.solve._unmodelled import Unmodelled, unmodelled
@@ -234,13 +234,10 @@ def _before(result: BatchResult, k: int) -> BeforeStart | None:
     if not k:
         return None
     try:
-        slow, mount = (
-            unmodelled(result),
-            mount_error(result.problem, result.graph, result.values, result.verdicts, result.prior),
-        )
+        slow = unmodelled(result)
+        by_mount = followed_before(result.problem, result.values, result.verdicts, result.prior, k)
     except (RuntimeError, np.linalg.LinAlgError):  # not determined; the window that follows says what it can
         return None
-    by_mount = None if mount is None else mount.in_world(result.values.atPose3(keys.pose(k)).rotation().matrix(), k)
     return BeforeStart(None if slow is None else Unmodelled(slow.rotation[k], slow.velocity[k]), by_mount)
 
 

@@ -7,8 +7,8 @@ with F, Q from one state to the next, J the information of all measurements sinc
 
     P+ = ((F P F' + Q)^-1 + J)^-1,    e+ = (1 - P+ J) F e + P+ J_p d
 
-An IMU whose mount is turned by m, body axes, measures the motion of a body that is turned as much, U m, and the sensors that of the
-body; so that does e+ = (1 - P+ J) (F (e + U m) - U+ m) to it, which is linear in m.
+An IMU whose mount is turned by m, body axes, measures the motion of a body that is turned as much, e + U m, and the sensors that of
+the body; so that becomes (1 - P+ J) F (e + U m) + P+ J U+ m, which is linear in m.
 
 The state has the slow errors of the other sensors with it: a compass whose mount offset is unknown holds a heading for a while,
 but does not tell it. P is computed here, not taken from the window: that is linearised anew now and then, and judges older
@@ -41,7 +41,7 @@ _MOUNT_EVERY_S = 0.5
 
 
 class BeforeStart(NamedTuple):
-    """What has been done to the first state of a window before it: by left-out errors; and (9, 3) rotation, position and velocity per turn of the mount."""
+    """What has been done to the first state of a window before it: by left-out errors; and the first rows (9, 3) of `by_mount`."""
 
     slow: Unmodelled | None
     by_mount: Array | None
@@ -67,7 +67,7 @@ class UnmodelledError:
         left_out: their processes, by receiver. estimated: those of the slow errors that the window estimates, by sensor.
         cov: (n + 3 m, n + 3 m) of e (rotation, position, velocity in axes of world; bias; slow errors that are estimated) and of the m
             errors (east, north, up).
-        by_mount: (n, 3) change of e per turn of the IMU's mount, body axes. mount_sigma_rad: of it, each axis.
+        by_mount: (n, 3) change of e + U m per turn m of the IMU's mount, body axes. mount_sigma_rad: of it, each axis.
         newest: the state that it is of. P: (n, n), covariance of that state without the errors, axes as of e.
     """
 
@@ -105,13 +105,15 @@ class UnmodelledError:
             np.vstack([np.eye(3), np.linalg.solve(P[_ROTATION, _ROTATION], P[_ROTATION, _CORE:]).T]),
             np.r_[_ROTATION, _CORE:n],
         )
+        R = newest.pose.rotation().matrix()
         by_mount = np.zeros((n, 3))
+        by_mount[2] = R[2]  # at the first data the IMU has levelled itself, and sensors tell the heading of the body
         if begun is not None and begun.slow is not None:
             cov[np.ix_(rows, rows)] += turned @ begun.slow.rotation @ turned.T
             cov[_VELOCITY, _VELOCITY] += begun.slow.velocity
         if begun is not None and begun.by_mount is not None:
-            by_mount[rows] = turned @ begun.by_mount[_ROTATION]
-            by_mount[3:9] = begun.by_mount[3:]
+            by_mount[:9] = begun.by_mount
+            by_mount[_CORE:] = turned[3:] @ (begun.by_mount[_ROTATION] - R)
         sizes = ErrorSizes(cov, by_mount)
         if last is not None and last.fits(sizes):
             sizes = last
@@ -152,11 +154,7 @@ class UnmodelledError:
             J[np.ix_(rows, rows)] += information
         kept = np.linalg.inv(np.eye(n) + predicted @ J)  # 1 - P+ J
         P = sound(kept @ predicted)
-        turned = self.by_mount.copy()
-        turned[_ROTATION] += self.newest.pose.rotation().matrix()
-        turned = F @ turned
-        turned[_ROTATION] -= newest.pose.rotation().matrix()
-        by_mount = kept @ turned
+        by_mount = kept @ (F @ self.by_mount) + (np.eye(n) - kept)[:, _ROTATION] @ newest.pose.rotation().matrix()
         # The errors move on first, and the state then follows them.
         decay, walk = _walks(self.left_out.values(), dt_s)
         on = np.zeros_like(self.cov)
@@ -178,7 +176,7 @@ class UnmodelledError:
         Args:
             lever_m: (3,) the point from the IMU, axes of world. Of its place without the left-out errors.
         """
-        turned = self.by_mount[_ROTATION]
+        turned = self.by_mount[_ROTATION] - self.newest.pose.rotation().matrix()
         by = np.vstack([self.by_mount[_POSITION] - skew(lever_m) @ turned, turned])
         cov = self.mount_sigma_rad**2 * by @ by.T
         cov[3:, 3:] += self.cov[_ROTATION, _ROTATION]

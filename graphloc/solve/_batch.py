@@ -127,7 +127,8 @@ def solve_batch(
     begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu)
     mount = None
     if not newest:
-        solved, mount = solved.with_mount_estimated(begun.prior, progress)
+        solved, prior, mount = solved.with_mount_estimated(begun.prior, progress)
+        begun = begun._replace(prior=prior)
     as_stated, misfit = solved.choice(), solved.misfit()
     passes, iterations = solved.settled.passes, begun.iterations + solved.settled.iterations
     for _ in range(_MAX_NOISE_ROUNDS):
@@ -205,13 +206,15 @@ class _Solved(NamedTuple):
         """Return the cost over its expectation."""
         return cost_without_outliers(self.settled) / max(expected_cost(self.problem, self.settled.verdicts), 1.0)
 
-    def with_mount_estimated(self, prior: StartPrior, progress: Progress) -> tuple[_Solved, MountError | None]:
-        """Return it with the mount of the IMU as the other sensors have it, and what that says of it."""
-        problem, settled, error = with_mount_estimated(*self, prior, progress, _LAST_PASSES)
+    def with_mount_estimated(
+        self, prior: StartPrior, progress: Progress
+    ) -> tuple[_Solved, StartPrior, MountError | None]:
+        """Return it with the mount of the IMU as the other sensors have it, the prior of the start there, and what that says of it."""
+        problem, settled, prior, error = with_mount_estimated(*self, prior, progress, _LAST_PASSES)
         if settled is self.settled:
-            return self, error
+            return self, prior, error
         passes, iterations = (getattr(self.settled, key) + getattr(settled, key) for key in ("passes", "iterations"))
-        return _Solved(problem, replace(settled, passes=passes, iterations=iterations)), error
+        return _Solved(problem, replace(settled, passes=passes, iterations=iterations)), prior, error
 
     def choice(self) -> _Choice:
         return _Choice(self.problem, self.settled.values, self.settled.verdicts)

@@ -2,7 +2,7 @@
 """How far the IMU's axes are from where its mount says, by what a solved run's other sensors say of the body.
 
 With the mount turned by a small rotation m, body axes, the IMU measures what it would if the body were turned as much, while all
-other sensors stay: its rows of the linearised run J dx = b become J dx + c m = b, with
+other sensors stay: its rows of the linearised run J dx = b, and that of its levelling at the start, become J dx + c m = b, with
 
     c = J_imu U,   U: m in the attitude of every state
 
@@ -16,12 +16,14 @@ of centimetres tell the heading of an IMU to some tenths of a degree, and state 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 from scipy.sparse import diags_array
 
+from graphloc import keys
 from graphloc.build import CONSTANT_TAILS, Problem, StartPrior, with_imu_turned
 from graphloc.errors import SolveError
 from graphloc.frames import Array, skew
@@ -57,10 +59,6 @@ class MountError(NamedTuple):
         by = np.concatenate([moved, turned], axis=1)
         return np.asarray(by @ self._beyond() @ by.transpose(0, 2, 1))
 
-    def in_world(self, R: Array, k: int) -> Array:
-        """Return the change (9, 3) of rotation, place and velocity of state k per turn, in axes of world; R: (3, 3) its attitude."""
-        return np.vstack([R @ self.pose[k, :3], R @ self.pose[k, 3:], self.velocity[k]])
-
     def velocity_covariance(self) -> Array:
         """Return what it adds to the covariance (N, 3, 3) of the velocity, world axes."""
         return np.asarray(self.velocity @ self._beyond() @ self.velocity.transpose(0, 2, 1))
@@ -89,24 +87,44 @@ def mount_error(
     sigma = mount_sigma_rad(problem)
     if sigma == 0.0:
         return None
-    n = len(problem.timeline)
-    told = follows = _followed(*sparse_rows(graph, values), n)
+    n, nodes = len(problem.timeline), len(problem.timeline.slow_stamps_ns)
+    told = follows = _followed(*sparse_rows(graph, values), n, nodes)
     if any(stream.left_out is not None for stream in problem.streams):
         # The graph takes their drift for motion, which would speak for a mount as if it were none.
         rows = linearised(*with_left_out(problem, values), verdicts, prior)
         root = root_weights(rows, -rows.b)
-        told = _followed(diags_array(root) @ rows.J, root * rows.b, n)
+        told = _followed(diags_array(root) @ rows.J, root * rows.b, n, nodes)
     var = sigma**2 * (1.0 + (problem.imu_turn_rad / sigma) ** 2 / CONSTANT_TAILS)
-    cov: Array = np.linalg.inv(told.left.T @ told.left + np.diag(1.0 / var))
+    cov = np.asarray(np.linalg.inv(told.left.T @ told.left + np.diag(1.0 / var)), dtype=np.float64)
     turn = cov @ (told.left.T @ told.b - problem.imu_turn_rad / var)
     X = follows.states
     if not (np.isfinite(cov).all() and np.isfinite(X).all()):
         raise RuntimeError("not finite")
-    first_velocity, first_pose = (
-        len(X) - 9 * n,
-        len(X) - 6 * n,
-    )  # keys are sorted by letter: velocities and poses come last
-    return MountError(turn, cov, X[first_pose:].reshape(n, 6, 3), X[first_velocity:first_pose].reshape(n, 3, 3))
+    # Keys are sorted by letter: velocities and poses come last.
+    return MountError(turn, cov, X[-6 * n :].reshape(n, 6, 3), X[-9 * n : -6 * n].reshape(n, 3, 3))
+
+
+def followed_before(
+    problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior: StartPrior, k: int
+) -> Array | None:
+    """Return by how much (9, 3) rotation, place and velocity of the IMU at state k, axes of world, follow the turn by the data before it.
+
+    None where the mount is taken as given. Arguments and errors as of `mount_error`.
+    """
+    if mount_sigma_rad(problem) == 0.0:
+        return None
+    rows, n = linearised(problem, values, verdicts, prior), len(problem.timeline)
+    before = rows.stamps_ns < problem.timeline.stamps_ns[k]
+    J, c = diags_array(root_weights(rows, -rows.b)) @ rows.J, _by_turn(rows.J, n, len(problem.timeline.slow_stamps_ns))
+    J, c = J[before], c[before]
+    used = abs(J).sum(axis=0) > 0.0
+    X = np.zeros((len(used), 3))
+    X[used] = -normal_solver(J[:, used])(J[:, used].T @ c)
+    if not np.isfinite(X).all():
+        raise RuntimeError("not finite")
+    R = values.atPose3(keys.pose(k)).rotation().matrix()
+    turned, moved = np.split(X[rows.first_pose + 6 * k :][:6], 2)
+    return np.vstack([R @ (turned + np.eye(3)), R @ moved, X[rows.first_velocity + 3 * k :][:3]])
 
 
 class _Followed(NamedTuple):
@@ -117,50 +135,70 @@ class _Followed(NamedTuple):
     b: Array
 
 
-def _followed(J: Any, b: Array, n: int) -> _Followed:
-    """Return how the states follow; the factors of the IMU between the n of them come first in J (rows, columns)."""
-    U = np.zeros((J.shape[1], 3))
-    U[-6 * n :].reshape(n, 6, 3)[:, :3] = np.eye(3)
-    c = J @ U
-    c[9 * (n - 1) :] = 0.0
+def _followed(J: Any, b: Array, n: int, nodes: int) -> _Followed:
+    """Return how the states follow, n of them with so many slow nodes."""
+    c = _by_turn(J, n, nodes)
     X = -normal_solver(J)(J.T @ c)
     return _Followed(X, c + J @ X, b)
 
 
+def _by_turn(J: Any, n: int, nodes: int) -> Array:
+    """Return c (rows, 3). The factors of the IMU between the n states come first in J (rows, columns).
+
+    Biases come first in the columns, and poses last, as keys are sorted by letter.
+    """
+    U = np.zeros((J.shape[1], 3))
+    U[-6 * n :].reshape(n, 6, 3)[:, :3] = np.eye(3)
+    c = np.asarray(J @ U)
+    levelled = abs(J[9 * (n - 1) :, : 6 * nodes]).sum(axis=1) > 0.0  # no other factor has an attitude and a bias
+    c[9 * (n - 1) :][~np.asarray(levelled).ravel()] = 0.0
+    return c
+
+
 def with_mount_estimated(
     problem: Problem, settled: Settled, prior: StartPrior, progress: Progress, most: int
-) -> tuple[Problem, Settled, MountError | None]:
+) -> tuple[Problem, Settled, StartPrior, MountError | None]:
     """Return the problem with the mount of its IMU as is most probable, settled in at most `most` passes; as they are if that is near.
 
     And what that says of the mount; None where it is taken as given, or not determined.
     """
     last = len(problem.timeline) - 1
 
-    def cost(problem: Problem, settled: Settled) -> float:
+    def cost(problem: Problem, settled: Settled, prior: StartPrior) -> float:
         squares = float(((problem.imu_turn_rad / mount_sigma_rad(problem)) ** 2).sum())
         off = 0.5 * CONSTANT_TAILS * float(np.log1p(squares / CONSTANT_TAILS))
         return off + cost_as_configured(problem, settled.values, 0, last, prior, judged=last)
 
-    def found(problem: Problem, settled: Settled) -> MountError | None:
+    def found(problem: Problem, settled: Settled, prior: StartPrior) -> MountError | None:
         try:
             return mount_error(problem, settled.graph, settled.values, settled.verdicts, prior)
         except (RuntimeError, np.linalg.LinAlgError):
             return None
 
-    error, lowest = found(problem, settled), np.inf
+    error, lowest = found(problem, settled, prior), np.inf
     for _ in range(_ROUNDS):
         if error is None or float(np.abs(error.turn_rad).max()) < _MATTERS * mount_sigma_rad(problem):
             break
         if np.isinf(lowest):
-            lowest = cost(problem, settled)
-        turned = with_imu_turned(problem, settled.values, error.turn_rad)
+            lowest = cost(problem, settled, prior)
+        turned, prior_there = (
+            with_imu_turned(problem, settled.values, error.turn_rad),
+            _prior_turned(prior, error.turn_rad),
+        )
         verdicts = weigh(turned, settled.values, first=0, last=last, stage=Stage.FINAL)
         try:
-            again = settle(turned, settled.values, verdicts, prior, progress, most)
+            again = settle(turned, settled.values, verdicts, prior_there, progress, most)
         except SolveError:
             break
-        if not (now := cost(turned, again)) < lowest:
+        if not (now := cost(turned, again, prior_there)) < lowest:
             break
-        problem, settled, lowest = turned, again, now
-        error = found(problem, settled)
-    return problem, settled, error
+        problem, settled, prior, lowest = turned, again, prior_there, now
+        error = found(problem, settled, prior)
+    return problem, settled, prior, error
+
+
+def _prior_turned(prior: StartPrior, turn_rad: Array) -> StartPrior:
+    """Return the prior of a start as levelled by an IMU whose mount is turned (3,), rad, body axes."""
+    if prior.level is None:
+        return prior
+    return replace(prior, level=prior.level.turned(gtsam.Rot3.Expmap(turn_rad).matrix()))

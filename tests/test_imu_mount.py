@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An IMU that is askew in its mount: found offline where other sensors tell, and in the bounds of both modes where they do not."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from graphloc import app, solve
+from graphloc.build import Problem
+from graphloc.config import KernelConfig, VesselConfig
+from graphloc.eval.metrics import compare_to_truth
+from graphloc.eval.simulate import Scenario, SimulatedRun
+from graphloc.frames import wrap_angle
+from graphloc.recording import Recording
+from graphloc.replay import replay
+from graphloc.solution import Solution
+from graphloc.solve._batch import BatchResult
+from graphloc.solve._imu_mount import MountError, mount_error
+from graphloc.solve._solution import make_solution
+from tests.slowly import simulate_slowly
+
+ASKEW_DEG = (1.5, -1.0, 3.0)
+
+
+def changed(config: VesselConfig, name: str, **keys: object) -> VesselConfig:
+    return config.with_sensors({name: config.sensors[name].model_copy(update=keys)})
+
+
+def loops(gnss_sigma_m: float) -> SimulatedRun:
+    """Half a minute of turns with fixes and a compass; small changes do not change the weights of any."""
+    scenario = Scenario(
+        path="loops", duration_s=35.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gnss_hz=5.0, gnss_sigma_m=gnss_sigma_m, compass_hz=5.0
+    )  # fmt: skip
+    run = simulate_slowly(scenario, 3, 5.0)
+    white = run.config.sensors["gnss"].slow_error.model_copy(update={"enabled": False})
+    linear = KernelConfig(kind="none")
+    config = changed(changed(run.config, "gnss", slow_error=white, kernel=linear), "compass", kernel=linear)
+    return replace(run, config=config)
+
+
+@pytest.fixture(scope="module")
+def simulated() -> SimulatedRun:
+    """Fixes good to centimetres."""
+    return loops(0.02)
+
+
+def askew(run: SimulatedRun, turn_deg: tuple[float, float, float] = ASKEW_DEG) -> SimulatedRun:
+    """The run, as recorded by an IMU that is turned against its mount by that rotation, body axes."""
+    imu = run.recording.imu
+    assert imu is not None
+    R = run.config.sensors["imu"].mount.R_body_sensor
+    # R_body_imu = Exp(turn) R, so what it measures is R' Exp(turn)' R times what it would.
+    turn = gtsam.Rot3.Expmap(np.radians(turn_deg)).matrix()
+    into = (R.T @ turn.T @ R).T
+    turned = replace(imu, accel_mps2=imu.accel_mps2 @ into, gyro_radps=imu.gyro_radps @ into)
+    return replace(run, recording=replace(run.recording, imu=turned))
+
+
+def gnss_compass(run: SimulatedRun) -> SimulatedRun:
+    """The run with a compass that is known to have no offset; its noise is simulated to 1 deg."""
+    return replace(run, config=changed(run.config, "compass", mount_offset_sigma_deg=0.0))
+
+
+def taken_as_given(run: SimulatedRun) -> SimulatedRun:
+    return replace(run, config=changed(run.config, "imu", mount_sigma_deg=0.0))
+
+
+def smoothed(run: SimulatedRun) -> Solution:
+    return app.smooth_recording(run.recording, run.config).solution
+
+
+def with_result(run: SimulatedRun) -> tuple[Solution, BatchResult]:
+    found: list[BatchResult] = []
+
+    def keep(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
+        found.append(result)
+        return make_solution(problem, recording, result)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solve, "make_solution", keep)
+        return smoothed(run), found[0]
+
+
+def error_of(result: BatchResult) -> MountError:
+    found = mount_error(result.problem, result.graph, result.values, result.verdicts, result.prior)
+    assert found is not None
+    return found
+
+
+def test_a_heading_of_known_mount_tells_how_the_imu_is_turned(simulated: SimulatedRun) -> None:
+    """In pitch and yaw; roll shows only in what the accelerations do to the height and the track."""
+    run = gnss_compass(askew(simulated))
+    solution, result = with_result(run)
+    error = error_of(result)
+    turn = np.degrees(result.problem.imu_turn_rad + error.turn_rad)
+    sigma = np.degrees(np.sqrt(np.diagonal(error.cov)))
+    assert (np.abs(turn - ASKEW_DEG) < 3.0 * sigma).all()
+    assert sigma[2] < 0.6
+    assert any("turn its mount" in line for line in solution.stats.warnings)
+    given = smoothed(taken_as_given(run))
+    assert not any("turn its mount" in line for line in given.stats.warnings)
+    ours, theirs = (compare_to_truth(s.trajectory, run.truth).position_rmse_m for s in (solution, given))
+    assert ours < 0.7 * theirs
+
+
+def test_fixes_alone_do_not_tell_it() -> None:
+    """They tell the heading of the IMU, not of the vessel; good to 0.2 m, not how the antenna lies from it either."""
+    run = loops(0.2)
+    fixes = tuple(m for m in run.recording.measurements if m.sensor == "gnss")
+    _, result = with_result(replace(run, recording=replace(run.recording, measurements=fixes)))
+    assert np.sqrt(np.diagonal(error_of(result).cov)) == pytest.approx(np.radians([1.0, 1.0, 1.0]), rel=0.05)
+
+
+def test_states_follow_the_mount_as_reckoned(simulated: SimulatedRun) -> None:
+    """By solving again with an IMU that is turned the other way, taken as given."""
+    turn = np.radians([0.05, -0.08, 0.1])
+    (before, result), (after, _) = (
+        with_result(taken_as_given(r)) for r in (simulated, askew(simulated, tuple(-np.degrees(turn))))
+    )
+    by = error_of(replace(result, problem=replace(result.problem, config=simulated.config)))
+    track, R = before.trajectory, before.trajectory.R_world_body
+    turned, moved = (np.einsum("nij,njk,k->ni", R, by.pose[:, part], turn) for part in (slice(3), slice(3, 6)))
+    places = moved + np.cross(turned, R @ -result.problem.t_body_imu_m)
+    for what, reckoned in (
+        (after.trajectory.p_world_m - track.p_world_m, places),
+        (wrap_angle(after.trajectory.yaw_rad - track.yaw_rad), turned[:, 2]),
+    ):
+        assert np.abs(what - reckoned).max() < 0.1 * np.abs(reckoned).max()
+
+
+def test_online_the_newest_state_follows_the_mount_as_its_bounds_say(simulated: SimulatedRun) -> None:
+    """Turned by a bit of its sigma about each axis in turn, the IMU moves place, heading and velocity by as much of what they are widened by."""
+    share = 0.2
+    as_given, widened = (replay(r.recording, r.config).solution for r in (taken_as_given(simulated), simulated))
+    track = as_given.trajectory
+    moved = []
+    for axis in np.eye(3):
+        run = taken_as_given(askew(simulated, tuple(share * axis)))
+        other = replay(run.recording, run.config).solution.trajectory
+        off = other.p_world_m[-1] - track.p_world_m[-1], wrap_angle(other.yaw_rad - track.yaw_rad)[-1:]
+        moved.append(np.concatenate(off) / share)
+    assert track.cov is not None
+    assert widened.trajectory.cov is not None
+    rows = [0, 1, 2, 5]
+    added = (widened.trajectory.cov[-1] - track.cov[-1])[rows, rows]
+    by_turns = (np.array(moved) ** 2).sum(axis=0)
+    assert np.sqrt(added) == pytest.approx(np.sqrt(by_turns), rel=0.1)
