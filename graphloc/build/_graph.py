@@ -73,6 +73,12 @@ class StartPrior:
     level: Level | None = None
     slow: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
 
+    def with_imu_turned(self, turn_rad: Array) -> StartPrior:
+        """Return it as levelled by an IMU whose mount is turned by a small rotation (3,), rad, body axes."""
+        if self.level is None:
+            return self
+        return replace(self, level=self.level.turned(gtsam.Rot3.Expmap(turn_rad).matrix()))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Past:

@@ -16,7 +16,6 @@ of centimetres tell the heading of an IMU to some tenths of a degree, and state 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gtsam
@@ -24,7 +23,7 @@ import numpy as np
 from scipy.sparse import diags_array
 
 from graphloc import keys
-from graphloc.build import CONSTANT_TAILS, Problem, StartPrior, with_imu_turned
+from graphloc.build import Problem, StartPrior, with_imu_turned
 from graphloc.errors import SolveError
 from graphloc.frames import Array, skew
 from graphloc.recording import Progress
@@ -34,6 +33,7 @@ from graphloc.solve._passes import Settled, cost_as_configured, settle
 
 _ROUNDS = 3
 _MATTERS = 0.5  # sigmas of the mount: less is in the bounds
+_MOST = 5.0  # sigmas: what speaks for more is another error, as a lever arm that is wrong by metres
 
 
 class MountError(NamedTuple):
@@ -94,9 +94,8 @@ def mount_error(
         rows = linearised(*with_left_out(problem, values), verdicts, prior)
         root = root_weights(rows, -rows.b)
         told = _followed(diags_array(root) @ rows.J, root * rows.b, n, nodes)
-    var = sigma**2 * (1.0 + (problem.imu_turn_rad / sigma) ** 2 / CONSTANT_TAILS)
-    cov = np.asarray(np.linalg.inv(told.left.T @ told.left + np.diag(1.0 / var)), dtype=np.float64)
-    turn = cov @ (told.left.T @ told.b - problem.imu_turn_rad / var)
+    cov = np.asarray(np.linalg.inv(told.left.T @ told.left + np.eye(3) / sigma**2), dtype=np.float64)
+    turn = cov @ (told.left.T @ told.b - problem.imu_turn_rad / sigma**2)
     X = follows.states
     if not (np.isfinite(cov).all() and np.isfinite(X).all()):
         raise RuntimeError("not finite")
@@ -162,12 +161,11 @@ def with_mount_estimated(
 
     And what that says of the mount; None where it is taken as given, or not determined.
     """
-    last = len(problem.timeline) - 1
+    last, sigma = len(problem.timeline) - 1, mount_sigma_rad(problem)
 
     def cost(problem: Problem, settled: Settled, prior: StartPrior) -> float:
-        squares = float(((problem.imu_turn_rad / mount_sigma_rad(problem)) ** 2).sum())
-        off = 0.5 * CONSTANT_TAILS * float(np.log1p(squares / CONSTANT_TAILS))
-        return off + cost_as_configured(problem, settled.values, 0, last, prior, judged=last)
+        off = problem.imu_turn_rad / sigma
+        return 0.5 * float(off @ off) + cost_as_configured(problem, settled.values, 0, last, prior, judged=last)
 
     def found(problem: Problem, settled: Settled, prior: StartPrior) -> MountError | None:
         try:
@@ -176,14 +174,17 @@ def with_mount_estimated(
             return None
 
     error, lowest = found(problem, settled, prior), np.inf
+    as_configured = problem, settled, prior, error
     for _ in range(_ROUNDS):
-        if error is None or float(np.abs(error.turn_rad).max()) < _MATTERS * mount_sigma_rad(problem):
+        if error is None or np.abs(error.turn_rad).max() < _MATTERS * sigma:
             break
+        if np.abs(problem.imu_turn_rad + error.turn_rad).max() > _MOST * sigma:
+            return as_configured
         if np.isinf(lowest):
             lowest = cost(problem, settled, prior)
         turned, prior_there = (
             with_imu_turned(problem, settled.values, error.turn_rad),
-            _prior_turned(prior, error.turn_rad),
+            prior.with_imu_turned(error.turn_rad),
         )
         verdicts = weigh(turned, settled.values, first=0, last=last, stage=Stage.FINAL)
         try:
@@ -195,10 +196,3 @@ def with_mount_estimated(
         problem, settled, prior, lowest = turned, again, prior_there, now
         error = found(problem, settled, prior)
     return problem, settled, prior, error
-
-
-def _prior_turned(prior: StartPrior, turn_rad: Array) -> StartPrior:
-    """Return the prior of a start as levelled by an IMU whose mount is turned (3,), rad, body axes."""
-    if prior.level is None:
-        return prior
-    return replace(prior, level=prior.level.turned(gtsam.Rot3.Expmap(turn_rad).matrix()))

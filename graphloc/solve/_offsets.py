@@ -25,7 +25,7 @@ import numpy as np
 from scipy.sparse import diags_array
 
 from graphloc import keys
-from graphloc.build import Problem, Stream, with_imu_turned
+from graphloc.build import Problem, StartPrior, Stream, with_imu_turned
 from graphloc.frames import Array
 from graphloc.graph import Constant, SlowProcess
 from graphloc.offsets import Offset, Offsets, Probe
@@ -47,8 +47,8 @@ def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
     Raises:
         RuntimeError, numpy.linalg.LinAlgError: a state or offset is not determined.
     """
-    problem, values = _with_offsets_free(result)
-    rows = linearised(problem, values, result.verdicts, result.prior)
+    problem, values, prior = _with_offsets_free(result)
+    rows = linearised(problem, values, result.verdicts, prior)
     columns: dict[tuple[str, Offset], Array] = {}
     for stream in problem.streams:
         wanted = tuple(probe.get(stream.config.kind, ()))
@@ -110,10 +110,12 @@ def _in_blocks(rows: Rows, left: Array, r: Array) -> tuple[Array, Array]:
     return np.array([left[p].T @ r[p] for p in parts]), np.array([left[p].T @ left[p] for p in parts])
 
 
-def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values]:
+def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values, StartPrior]:
     """Return the problem without mount offsets that are states already, that of the IMU among them, and with the slow errors that were left out."""
     problem, values = with_left_out(result.problem, result.values)
+    prior = result.prior
     if problem.imu_turn_rad.any():
+        prior = prior.with_imu_turned(-problem.imu_turn_rad)
         problem = with_imu_turned(problem, values, -problem.imu_turn_rad)
     streams = []
     for stream in problem.streams:
@@ -121,7 +123,7 @@ def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values]:
         if slow is not None and any(slow.constant & (np.array(slow.axes) == "yaw")):
             slow = _without_mount(problem, stream, slow, values)
         streams.append(replace(stream, slow=slow, constants=_surveyed(stream)))
-    return replace(problem, streams=tuple(streams)), values
+    return replace(problem, streams=tuple(streams)), values, prior
 
 
 def _surveyed(stream: Stream) -> tuple[Constant, ...]:
