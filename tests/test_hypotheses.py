@@ -20,7 +20,7 @@ from graphloc.solve._decide import Verdict, by_hypotheses
 from graphloc.solve._hypotheses import FalseSequence
 from graphloc.solve._prediction import Prediction
 from graphloc.solve._warnings import joint_rejection_warning
-from tests.slowly import simulate_slowly
+from tests.slowly import simulate_slowly, sparsely
 
 SIGMA_M = 0.2
 
@@ -172,7 +172,7 @@ def test_nothing_but_noise_makes_no_long_chain() -> None:
     ],
 )
 def test_false_matches_that_repeat_do_not_bend_the_track(noise: Any, seed: int, why: str) -> None:
-    run = simulate_slowly(bl_scenario(3, noise), seed, rate_hz=2.5)
+    run = sparsely(simulate_slowly(bl_scenario(3, noise), seed, rate_hz=2.5))
     assert compare_to_truth(app.simulated(run).solution.trajectory, run.truth).position_rmse_m < 0.2, why
 
 
@@ -218,7 +218,7 @@ def test_few_or_brief_ones_are_no_news() -> None:
 def test_long_outage_does_not_lock_the_matches_out() -> None:
     """After 40 s without fixes and matches the prediction is metres off: the returning matches are believed."""
     scenario = replace(bl_scenario(1, "drift"), duration_s=100.0, outage_s=(40.0, 80.0))
-    run = simulate_slowly(scenario, 5, rate_hz=2.5)
+    run = sparsely(simulate_slowly(scenario, 5, rate_hz=2.5))
     solution = app.simulated(run).solution
     after = run.truth.stamps_ns[(run.truth.stamps_ns - run.truth.stamps_ns[0]) > 90_000_000_000]
     error = solution.trajectory.at(after[:-200]).p_world_m - run.truth.at(after[:-200]).p_world_m
