@@ -178,8 +178,10 @@ def test_false_matches_that_repeat_do_not_bend_the_track(noise: Any, seed: int, 
 
 def test_matches_that_are_refused_together_are_reported() -> None:
     """For 20 s all say 15 m beside: so many are not false by chance. Usual ones, 40 % of them, are not said."""
-    run = simulate_slowly(
-        replace(bl_scenario(1, "clean"), duration_s=42.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0), 3, rate_hz=2.5
+    run = sparsely(
+        simulate_slowly(
+            replace(bl_scenario(1, "clean"), duration_s=42.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0), 3, rate_hz=2.5
+        )
     )
     begin_ns = int(run.truth.stamps_ns[0]) + 15_000_000_000
 
