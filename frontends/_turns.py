@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.signal import lfilter
 
 from graphloc.config import CompassConfig, ImuConfig
 from graphloc.errors import InputError
@@ -305,6 +304,8 @@ def yaw_rate(t_s: Array, accel_mps2: Array, gyro_radps: Array, up: Array) -> Arr
 
 def _joined(t_s: Array, rate: Array, slow: Array) -> Array:
     """Return an angle (N,), rad, whose changes within `_TILT_S` are those of a rate (N,), and the others those of another angle (N,)."""
+    from scipy.signal import lfilter  # brings scipy.stats: a fifth of what most commands need to begin
+
     steps = np.diff(t_s)
     if not len(steps) or np.median(steps) <= 0.0:
         return slow

@@ -46,6 +46,12 @@ def bad() -> tuple[SimulatedRun, Ablated]:
     return run, ablate(replace(run.recording, truth=None), run.config)
 
 
+@pytest.fixture(scope="module")
+def whole(bad: tuple[SimulatedRun, Ablated]) -> Solution:
+    run, _ = bad
+    return app.smooth_recording(replace(run.recording, truth=None), run.config).solution
+
+
 def of(ablated: Ablated, name: str) -> Effect:
     return next(e for e in ablated.effects if e.without == name)
 
@@ -186,24 +192,25 @@ def test_a_name_cannot_end_a_cell_or_a_row() -> None:
     assert "<i>" not in grid.as_html()
 
 
-def test_a_contradiction_is_of_the_others_and_slow_errors_are_owned_to(bad: tuple[SimulatedRun, Ablated]) -> None:
+def test_a_contradiction_is_of_the_others_and_slow_errors_are_owned_to(
+    bad: tuple[SimulatedRun, Ablated], whole: Solution
+) -> None:
     """All fixes 8 m east of a 2 m slow error: sqrt of (8^2 / (2^2 + white + bound)), over what chi-square(3) has."""
     run, _ = bad
-    solution = app.smooth_recording(replace(run.recording, truth=None), run.config).solution
-    datum = solution.datum
+    datum = whole.datum
 
     def moved(m: GnssPosition) -> GnssPosition:
         enu = datum.enu_from_geodetic(*(np.array([v]) for v in m.position)) + np.array([8.0, 0.0, 0.0])
         return replace(m, position=type(m.position)(*(float(v[0]) for v in datum.geodetic_from_enu(enu).T)))
 
     shifted = tuple(moved(m) if isinstance(m, GnssPosition) else m for m in run.recording.measurements)
-    found = contradiction(solution, replace(run.recording, measurements=shifted), run.config, "gnss", SENSORS)
+    found = contradiction(whole, replace(run.recording, measurements=shifted), run.config, "gnss", SENSORS)
     assert found is not None
     assert found.apart_m == pytest.approx(8.0, abs=0.4)
-    sigma2 = 2.0**2 + 0.045 + np.median(solution.trajectory.cov[:, 0, 0])  # type: ignore[index]
+    sigma2 = 2.0**2 + 0.045 + np.median(whole.trajectory.cov[:, 0, 0])  # type: ignore[index]
     assert found.sigmas == pytest.approx(np.sqrt(8.0**2 / sigma2 / 2.366), rel=0.1)
     few = replace(run.recording, measurements=tuple(m for m in shifted if isinstance(m, CompassHeading))[:4])
-    assert contradiction(solution, few, run.config, "compass", SENSORS) is None
+    assert contradiction(whole, few, run.config, "compass", SENSORS) is None
 
 
 def stated(solution: Solution, variances: tuple[float, ...]) -> Solution:
@@ -211,12 +218,6 @@ def stated(solution: Solution, variances: tuple[float, ...]) -> Solution:
     track = solution.trajectory
     cov = np.tile(np.diag(variances), (len(track), 1, 1))
     return replace(solution, trajectory=replace(track, cov=cov))
-
-
-@pytest.fixture(scope="module")
-def whole(bad: tuple[SimulatedRun, Ablated]) -> Solution:
-    run, _ = bad
-    return app.smooth_recording(replace(run.recording, truth=None), run.config).solution
 
 
 def test_what_the_solution_knows_counts_along_the_worlds_axes(

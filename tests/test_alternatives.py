@@ -20,7 +20,7 @@ from graphloc.graph import Residual
 from graphloc.measurements import Measurement, PoseFix, PoseMode
 from graphloc.online._alternatives import choices
 from graphloc.replay import replay
-from tests.slowly import simulate_slowly
+from tests.slowly import simulate_slowly, sparsely
 
 SIGMA_M, FALSE_M, FALSE = 0.3, pose.FALSE_SPREAD_M, 0.2
 PRIOR = np.array([[1.0, 0.9, 0.7], [0.9, 1.1, 0.9], [0.7, 0.9, 1.3]])  # of the places x at three stamps, m^2
@@ -96,7 +96,7 @@ def test_all_choices_are_weighed_whichever_is_in_the_graph(held: tuple[int, ...]
 
 def test_two_false_ones_that_agree_are_within_the_bounds_and_given_up_when_a_right_one_comes() -> None:
     """Two of them, 1.6 m off, after some seconds without any: four sigmas of what is predicted."""
-    run = simulate_slowly(replace(bl_scenario(1, "drift"), false_fraction=0.0, duration_s=32.0), 3)
+    run = sparsely(simulate_slowly(replace(bl_scenario(1, "drift"), false_fraction=0.0, duration_s=32.0), 3))
     matches = run.recording.of(PoseFix)
     start_ns = int(run.truth.stamps_ns[0])
     silent = {m.seq for m in matches if 17.0 < (m.stamp_ns - start_ns) * 1e-9 < 21.0}

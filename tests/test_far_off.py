@@ -136,7 +136,7 @@ def jumped(
 ) -> tuple[SimulatedRun, Recording, VesselConfig]:
     """Fixes, compass and velocities (0.1 m/s); the fixes 11 m off for a while."""
     run = simulate(
-        Scenario(path="loops", duration_s=length_s, noise="clean", imu_hz=50.0, gnss_hz=4.0, compass_hz=4.0), seed
+        Scenario(path="loops", duration_s=length_s, noise="clean", imu_hz=50.0, gnss_hz=4.0, compass_hz=1.0), seed
     )
     imu, truth, rng = run.recording.imu, run.truth, np.random.default_rng(seed)
     assert imu is not None

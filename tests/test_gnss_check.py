@@ -14,7 +14,7 @@ from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition, Measurement, PoseFix
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import S
-from tests.slowly import simulate_slowly
+from tests.slowly import simulate_slowly, sparsely
 
 SIGMA_M, LASTING_S = 2.0, 200.0
 DATUM = Datum(Geodetic(57.7, 11.7, 36.0))
@@ -25,7 +25,7 @@ def run() -> SimulatedRun:
     scenario = Scenario(
         path="loops", duration_s=60.0, noise="clean", false_fraction=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0
     )
-    return simulate_slowly(scenario, 21, rate_hz=2.5)
+    return sparsely(simulate_slowly(scenario, 21, rate_hz=2.5), 2)
 
 
 def said(run: SimulatedRun, east_north_m: Array, every_s: int = 1, up_m: float = 0.0) -> list[str]:

@@ -17,6 +17,7 @@ from graphloc.graph import Residual, Sensor
 from graphloc.linear import factors_of
 from graphloc.solve import _batch, smooth
 from graphloc.solve._choices import other_choices
+from tests.slowly import sparsely
 
 
 def same(residual: Residual, row: Sensor, m: Any, config: Any, at: Any, mode: int) -> None:
@@ -48,7 +49,7 @@ def test_a_residual_that_is_handed_on_is_that_at_its_attachment(monkeypatch: pyt
 
     monkeypatch.setattr(_graph, "factors_of", checked)
     monkeypatch.setattr(_batch, "other_choices", choices)
-    run = simulate(replace(bl_scenario(3, "drift"), duration_s=40.0), 4)
+    run = sparsely(simulate(replace(bl_scenario(3, "drift"), duration_s=40.0), 4))
     smooth(run.recording, run.config, app.choose_datum(run.recording, run.config), rows=SENSORS, inertial=INERTIAL)
     assert min(given[kind] for kind in ("gnss", "compass", "pose")) > 50
     assert tried["pose"] > 10

@@ -29,6 +29,7 @@ from graphloc.solution import Health, Solution
 from graphloc.solve import _batch
 from graphloc.solve._start import Begun
 from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
+from tests.slowly import slowly
 from tests.test_online_faults import at_s, run_of, smoother
 
 S = 1_000_000_000
@@ -124,9 +125,11 @@ def test_it_is_left_out_only_where_a_motion_of_a_vessel_explains_the_denials(
     assert blamed(feed(online, run_of(), arrivals)) == 0
 
 
-def smoothed(change: Change, from_s: float = 12.0, until_s: float = 16.0) -> tuple[Solution, Recording, TrackErrors]:
+def smoothed(
+    change: Change, from_s: float = 12.0, until_s: float = 16.0, rate_hz: float = 2.5
+) -> tuple[Solution, Recording, TrackErrors]:
     """The same offline."""
-    run = run_of()
+    run = slowly(run_of(), rate_hz)
     samples = [a.m for a in changed(change, from_s, until_s) if isinstance(a.m, ImuSample)]
     assert run.recording.imu is not None
     imu = replace(
@@ -143,7 +146,7 @@ def smoothed(change: Change, from_s: float = 12.0, until_s: float = 16.0) -> tup
 
 @pytest.mark.parametrize("change", [axes_swapped, in_g])
 def test_offline_it_is_left_out_where_it_is_wrong(change: Change) -> None:
-    solution, recording, off = smoothed(change)
+    solution, recording, off = smoothed(change, rate_hz=1.25)
     assert np.linalg.norm(off.position_m[:, :2], axis=1).max() < 1.0
     assert np.abs(off.heading_rad).max() < np.radians(8.0)
     (said,) = (w for w in solution.stats.warnings if "contradicts the other sensors, which agree" in w)
@@ -158,7 +161,7 @@ def test_offline_it_is_left_out_where_it_is_wrong(change: Change) -> None:
 
 def test_offline_it_is_found_in_the_first_window() -> None:
     """Aligned to rates that are wrong there, the run ended 122 m and 180 deg off, and took 15 times as long."""
-    solution, _, off = smoothed(in_degrees, 6.0, 9.0)
+    solution, _, off = smoothed(in_degrees, 6.0, 9.0, rate_hz=1.25)
     assert np.linalg.norm(off.position_m[:, :2], axis=1).max() < 1.0
     assert np.abs(off.heading_rad).max() < np.radians(8.0)
     assert any("contradicts the other sensors, which agree" in w for w in solution.stats.warnings)

@@ -20,6 +20,7 @@ from graphloc.measurements import CompassHeading, GnssPosition, Measurement, Pos
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 from graphloc.solve._legs import overlap_ns, seams
+from tests.slowly import sparsely
 
 S = 10**9
 LEG_S = 45.0
@@ -51,7 +52,7 @@ def begin_ns(run: SimulatedRun) -> int:
 
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
-    return simulate(LOOPS, 3)
+    return sparsely(simulate(LOOPS, 3), 2)
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from graphloc.online._heading_check import HeadingCheck
 from graphloc.recording import Recording
 from graphloc.replay import Replayed, replay
 from graphloc.solution import Health
-from tests.slowly import with_few_states
+from tests.slowly import sparsely, with_few_states
 
 SECOND = 1_000_000_000
 
@@ -28,7 +28,7 @@ SECOND = 1_000_000_000
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
     scenario = replace(bl_scenario(1, "clean"), duration_s=58.0, pose_hz=0.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0)
-    return simulate(scenario, 4)
+    return sparsely(simulate(scenario, 4), 2)
 
 
 def replayed(recording: Recording, config: VesselConfig) -> Replayed:
@@ -86,7 +86,7 @@ def test_nothing_is_reported_of_a_craft_that_goes_astern(run: SimulatedRun) -> N
 def test_nothing_is_reported_of_a_gyroscope_with_a_bias(overturned: bool) -> None:
     """By 0.02 rad/s about the vertical, as cheap ones have: carried on raw, it turned what is felt by 28 deg."""
     scenario = replace(bl_scenario(1, "clean"), duration_s=70.0, pose_hz=0.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0)
-    run = simulate(scenario, 4)
+    run = sparsely(simulate(scenario, 4), 2)
     imu = run.recording.imu
     assert imu is not None
     biased, config = replace(imu, gyro_radps=imu.gyro_radps + np.array([0.0, 0.0, 0.02])), run.config

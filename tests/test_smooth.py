@@ -17,7 +17,7 @@ from graphloc.eval.simulate import Scenario, bl_scenario
 from graphloc.measurements import GnssPosition, PoseFix
 from graphloc.recording import Recording
 from graphloc.time import stamps_of
-from tests.slowly import beside_filters, simulate_slowly
+from tests.slowly import beside_filters, simulate_slowly, sparsely
 
 SHORT = Scenario(duration_s=40.0, noise="drift", imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0)
 
@@ -109,7 +109,7 @@ def test_bad_start_is_not_lost() -> None:
 
 def test_comes_back_after_an_outage() -> None:
     scenario = replace(bl_scenario(1, "clean"), duration_s=80.0, outage_s=(25.0, 55.0))
-    run = simulate_slowly(scenario, 3)
+    run = sparsely(simulate_slowly(scenario, 3))
     track = app.simulated(run).solution.trajectory
     at = np.array([run.truth.stamps_ns[6500]])
     error = np.hypot(*(track.at(at).p_world_m - run.truth.at(at).p_world_m)[0, :2])

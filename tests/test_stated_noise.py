@@ -46,7 +46,7 @@ def test_what_is_white_is_found_beside_errors_that_grow(k: int) -> None:
 
 def noisy_headings(seed: int) -> SimulatedRun:
     """BL case 1, whose compass states 0.2 deg and scatters by 2."""
-    run = simulate(replace(bl_scenario(1, "drift"), duration_s=40.0, gnss_hz=2.0, compass_hz=5.0), seed)
+    run = simulate(replace(bl_scenario(1, "drift"), duration_s=40.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=5.0), seed)
     rng = np.random.default_rng(seed)
 
     def told(m: Measurement) -> Measurement:
