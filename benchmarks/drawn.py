@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from _rows import Row, row
 from _vessels import DrawnRun, drawn_run
+from scipy.spatial.transform import Rotation
 
 from graphloc import app
 from graphloc.errors import GraphlocError
@@ -30,7 +31,7 @@ from graphloc.solution import Solution
 from graphloc.trajectory import Trajectory
 
 SEEDS = range(1000, 1080)  # none was looked at when a model or a number was chosen
-NOISE_SEEDS, STATED_SEEDS = range(1100, 1116), range(1120, 1136)  # nor these
+NOISE_SEEDS, STATED_SEEDS, ASKEW_SEEDS = range(1100, 1116), range(1120, 1136), range(1140, 1156)  # nor these
 Found = dict[str, Any]
 _TOO_SURE = 6.0  # horizontal NEES: 2 where the covariance is true
 
@@ -179,6 +180,43 @@ def stated(pool: ProcessPoolExecutor) -> list[Row]:
     """Figures of fixes and matches that state less noise than they have."""
     found = list(pool.map(_stating, STATED_SEEDS))
     return _variants("F.stated", f"{len(found)} drawn vessels, stated sigmas", found)
+
+
+def _askew(run: DrawnRun) -> DrawnRun:
+    """The vessel, whose IMU is turned against its mount by 1 deg, 1 sigma, about each axis."""
+    imu, R = run.recording.imu, run.config.sensors["imu"].mount.R_body_sensor
+    assert imu is not None
+    turn = Rotation.from_rotvec(np.random.default_rng([run.drawn["seed"], 8]).normal(0.0, np.radians(1.0), 3))
+    into = R.T @ turn.as_matrix() @ R  # of rows
+    turned = replace(imu, accel_mps2=imu.accel_mps2 @ into, gyro_radps=imu.gyro_radps @ into)
+    return replace(run, recording=replace(run.recording, imu=turned))
+
+
+def _as_given(run: DrawnRun) -> DrawnRun:
+    """The vessel, whose IMU's mount is taken as given."""
+    imu = run.config.sensors["imu"].model_copy(update={"mount_sigma_deg": 0.0})
+    return replace(run, config=run.config.with_sensors({"imu": imu}))
+
+
+def _mounted(seed: int) -> Found:
+    drawn = drawn_run(seed)
+    askew = _askew(drawn)
+    return _both_ways({"as configured": drawn, "askew, taken as given": _as_given(askew), "askew": askew})
+
+
+def askew(pool: ProcessPoolExecutor) -> list[Row]:
+    """Figures of an IMU that sits askew."""
+    found = list(pool.map(_mounted, ASKEW_SEEDS))
+    label = f"{len(found)} drawn vessels, IMU's mount"
+    rows = _variants("F.mount", label, found)
+    for way in found[0]:
+        held = _column(found, way, "heading_coverage").mean() * 100
+        rows += [
+            row("F.mount", f"{label} {way}: heading RMSE, mean", _column(found, way, "heading_deg").mean(), "deg"),
+            row("F.mount", f"{label} {way}: 95 % coverage of the heading, mean", held, "%"),
+            row("F.mount", f"{label} {way}: 95 % coverage, mean", _column(found, way, "coverage").mean() * 100, "%"),
+        ]  # fmt: skip
+    return rows
 
 
 def _line(found: Found, before: Found | None) -> str:

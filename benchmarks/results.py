@@ -78,6 +78,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "F.6": sweep.workers,
     "F.cal": calibration.figures,
     "F.drawn": drawn.figures,
+    "F.mount": drawn.askew,
     "F.noise": drawn.noise,
     "F.stated": drawn.stated,
 }

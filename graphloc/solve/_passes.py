@@ -12,7 +12,7 @@ from graphloc.build import Made, Past, Problem, StartPrior, build_graph, cost_of
 from graphloc.recording import Progress
 from graphloc.solve._decide import Stage, Verdicts, decisions, log_evidence, met, weigh
 from graphloc.solve._optimize import full_step, optimize
-from graphloc.solve._stretch import moved
+from graphloc.solve._stretch import moved, unwound
 
 SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1
 _ROUGHLY_SETTLED_M = 0.5
@@ -83,15 +83,15 @@ def settle(
         done = None  # frees its graph before the next one is made: gigabytes on a run of hours
         # The first pass removes the seams between windows; after it one step per pass is enough.
         done = (optimise_run if n == 0 else refine_run)(problem, estimate, verdicts, prior)
-        estimate, iterations = done.values, iterations + done.iterations
+        estimate, iterations = unwound(problem, done.values), iterations + done.iterations
         used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage=Stage.FINAL)
         _date(verdicts, used, n + 1)
         progress("final passes", n + 1, most)
-        if n > 0 and done.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
+        if estimate is done.values and n > 0 and done.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
             break
     assert done is not None
     return Settled(
-        values=estimate,
+        values=done.values,
         graph=done.graph,
         made=done.made,
         verdicts=verdicts,
@@ -134,7 +134,7 @@ def rough_passes(
         for n in range(most):
             verdicts = weigh(problem, estimate, first=0, last=last, stage=stage)
             done = optimise_run(problem, estimate, verdicts, prior, jumps=stage is not Stage.FAR)
-            estimate = done.values
+            estimate = unwound(problem, done.values)
             passes, iterations = passes + 1, iterations + done.iterations
             progress(f"{stage} passes", n + 1, most)
             if done.moved_m < _ROUGHLY_SETTLED_M:

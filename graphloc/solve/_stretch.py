@@ -132,6 +132,28 @@ def _constants(problem: Problem) -> list[int]:
     return [key for stream in problem.streams for key in constant_keys(stream)]
 
 
+def unwound(problem: Problem, values: gtsam.Values) -> gtsam.Values:
+    """Return the values of a run with the yaws of its sensors' mounts within half a turn; these same where they are.
+
+    While the heading is found such a yaw may go round, by whole turns that nothing tells; its prior then hardly leads back.
+    """
+    found = values
+    for stream in problem.streams:
+        slow = stream.slow
+        if slow is None or "yaw" not in slow.axes or not slow.constant[slow.axes.index("yaw")]:
+            continue
+        yaw, names = (
+            slow.axes.index("yaw"),
+            [keys.slow(stream.number, j) for j in range(len(problem.timeline.slow_stamps_ns))],
+        )
+        turns = np.round(values.atVector(names[0])[yaw] / (2.0 * np.pi))
+        if turns:
+            found = gtsam.Values(found) if found is values else found
+            for key in names:
+                found.update(key, found.atVector(key) - 2.0 * np.pi * turns * np.eye(len(slow.axes))[yaw])
+    return found
+
+
 def slow_at(problem: Problem, values: gtsam.Values, j: int) -> dict[int, Array]:
     return {s.number: values.atVector(keys.slow(s.number, j)) for s in problem.streams if s.slow is not None}
 
