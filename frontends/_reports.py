@@ -128,6 +128,7 @@ class GnssReport:
         white_m: the horizontal scatter, where no motion is in it: fixes come fast, or scatter by more than a craft would.
         spans_s: time from its first fix to its last. late_s: what should be added to its stamps by the accelerometer, and
             1 sigma; None where that does not tell. late_by: whose motion told so: its own, or that of a velocity of the same device.
+        hinted_s: likewise, where that is likelier than none and not clear.
         frozen, stored: warning where it repeats one position while the vessel moves, or one of before the run; '' where it does not.
         wander: by how much their error changes along the way, by `wander_by`, wheels or a velocity; empty where these do not tell.
         uneven: how unevenly its fixes are stamped; None where these tell when each was measured.
@@ -158,6 +159,7 @@ class GnssReport:
     spans_s: float = 0.0
     late_s: tuple[float, float] | None = None
     late_by: str = ""
+    hinted_s: tuple[float, float] | None = None
     uneven: Uneven | None = None
     apart_m: float = 0.0
     apart_from: str = ""
