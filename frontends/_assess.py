@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from graphloc.config import GnssConfig
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends import _clock
-from graphloc.frontends._fixes import RTK_SIGMA_M, scatter_m, stored, stored_warning
+from graphloc.frontends._fixes import RTK_SIGMA_M, scatter_m, stored, stored_warning, uneven
 from graphloc.frontends._reports import GnssReport, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import TopicData
@@ -262,6 +262,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         first=vec(rows[0, :3]),
         without_height=int(np.isnan(fixes.rows[every[np.isin(fixes.stamps_ns[every], stamps)], 2]).sum()),
         white_m=scatter_m(stamps[~bad], own[:, :2]),
+        uneven=uneven(stamps[~bad], own),
         spans_s=float(stamps[-1] - stamps[0]) / NS_PER_S,
         frozen="".join(frozen_fixes_warning(fixes.topic, stamps, bad)),
         stored="".join(stored_warning(fixes.topic, places[:, :3], old)),

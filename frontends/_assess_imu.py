@@ -20,7 +20,7 @@ from graphloc.frontends._reports import ImuReport, MountGuess
 from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, turns_gravity, without_gravity
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._turning import Turning, against_turning
+from graphloc.frontends._turning import Turning, against_turning, left_of_turns
 from graphloc.frozen_imu import frozen_imu_warning, frozen_samples
 from graphloc.imu_spikes import spike_warning, spikes
 from graphloc.measurements import ImuSeries
@@ -29,7 +29,7 @@ from graphloc.time import NS_PER_S
 from graphloc.white_noise import white_noise
 
 # Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
-_COURSE_S, _COURSE_CLEAR = 12.0, 0.6
+_COURSE_S, _COURSE_CLEAR, _LEFT_OF_TURNS = 12.0, 0.6, 0.5
 _UPSIDE_DOWN_DEG = 150.0
 _QUIET_S, _STANDS_S = (
     2,
@@ -213,6 +213,21 @@ def _against_courses(imu: TopicData, report: ImuReport, courses: Courses | None,
     return against_turning(turning, courses.stamps_ns, course, _COURSE_S, _COURSE_CLEAR)
 
 
+def _turning_axis(
+    imu: TopicData, report: ImuReport, courses: Courses | None, tree: StaticTree, body: str
+) -> Array | None:
+    """Return the axis (3,) of the sensor, or its opposite, about which it turns as the courses of the fixes do; None if nothing tells."""
+    if courses is None or len(courses.stamps_ns) < 20:
+        return None
+    course, left = np.unwrap(courses.course_rad), []
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    for axis in axes:
+        mount = replace(report.mount, rpy_deg=vec(np.degrees(rpy_from_rotation(_level(axis)))))
+        turning = turning_of(imu, replace(report, mount=mount), tree, body)
+        left.append(left_of_turns(turning, courses.stamps_ns, course, _COURSE_S))
+    return axes[int(np.argmin(left))] if min(left) < _LEFT_OF_TURNS else None
+
+
 def _righted(
     report: ImuReport,
     imu: TopicData,
@@ -230,16 +245,21 @@ def _righted(
     Args:
         samples: acceleration (N, 3) m/s^2 and rate (N, 3) rad/s of usable samples.
     """
-    sense = _against_courses(imu, report, courses, tree, body)
     accel, gyro = samples
+    pose = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
+    if pose is None and report.gravity == "removed":
+        up = _turning_axis(imu, report, courses, tree, body)
+        if up is None or up[2] > 0.0:
+            return report
+        name = f"{'+' if up.sum() > 0.0 else '-'}{'xyz'[int(np.abs(up).argmax())]}"
+        why = (
+            f"its gyro turns about {name} as the courses of the fixes do: taken for up, as there is no gravity to tell"
+        )
+        return replace(report, mount=_turned(imu, accel, gyro, motions, _level(up), why))
+    sense = _against_courses(imu, report, courses, tree, body)
     if sense == 0:
         return report
-    pose = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
     against = "its gyro turns against the courses of the fixes"
-    if pose is None and sense < 0 and report.gravity == "removed":
-        why = f"{against}: taken as lying on its back, as there is no gravity to check by"
-        mount = _turned(imu, accel, gyro, motions, np.diag([1.0, -1.0, -1.0]), why)
-        return replace(report, mount=mount)
     if pose is None and sense < 0:
         why = f"{against}: its accelerations look inverted, or its axes are left-handed; or the fixes have latitude and longitude swapped"
         mount = mount_guess(imu, -accel, gyro, motions, tree, body)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.frames import Array, rpy_from_rotation
+from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation
 from graphloc.frontends._assess import MeasuredMotion, motion_of_places, sane, track, vec
 from graphloc.frontends._assess_world import World
 from graphloc.frontends._reports import (
@@ -230,7 +230,10 @@ def motions_of(
     Args:
         wheels: odometry that reports the speed along the vessel. twists: velocities and their axes; those that fit the track in
             no axes are something else, as a `Vector3Stamped` may be anything.
+
+    A Doppler log of which no tf tells how it sits, and its maker may have it at 45 deg, is asked only where nothing else moves.
     """
+    logs: list[MeasuredMotion] = []
     found = [m for s in wheels if (m := _told(s, BODY_AXES)) and float(np.ptp(m.speed_mps)) > 0.2]
     for stream, report in twists:
         if (
@@ -239,19 +242,23 @@ def motions_of(
             or (stream.msgtype == VECTOR and report.axes not in (EAST_AXES, NORTH_AXES))
         ):
             continue
-        motion = _told(stream, report.axes or EAST_AXES)
+        log = report.mount if report.tf_frame is not None else None
+        motion = _told(
+            stream, report.axes or EAST_AXES, None if log is None else rotation_from_rpy_deg(np.array(log.rpy_deg))
+        )
         if motion is not None and float(np.percentile(np.abs(motion.speed_mps), 90)) > 0.5:
-            found.append(motion)
+            (found if report.mount is None or log is not None else logs).append(motion)
     ways = [(s, *track(s)[:2]) for s in fixes]
-    return found + [m for s, at, p in ways if (m := motion_of_places(s.topic, at, p))]
+    return found + [m for s, at, p in ways if (m := motion_of_places(s.topic, at, p))] or logs
 
 
-def _told(stream: TopicData, axes: str) -> MeasuredMotion | None:
-    """Return the motion by a stream of velocities; NaN before the first fix."""
+def _told(stream: TopicData, axes: str, R_body_sensor: Array | None = None) -> MeasuredMotion | None:
+    """Return the motion by a stream of velocities; NaN before the first fix. `R_body_sensor`: (3, 3), where its axes are turned."""
     keep = sane(stream, np.s_[-3:-1])
     if len(keep) <= _FEWEST:
         return None
     v = stream.rows[keep, -3:]
+    v = v if R_body_sensor is None else v @ R_body_sensor.T
     origin = int(stream.stamps_ns[keep[0]])
     t = (stream.stamps_ns[keep] - origin) / NS_PER_S
     if axes == BODY_AXES:

@@ -276,6 +276,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     lines.append(_antenna_line(gnss.tf_frame, "from tf"))
     lines += _scatter_lines(gnss)
     lines += _rtk_lines(gnss)
+    lines += _uneven_lines(gnss)
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
     if wanders:
         lines.append(f"  min_vertical_sigma_m: 5.0  # guess: height ranges over {gnss.height_range_m:.0f} m")
@@ -362,6 +363,17 @@ def _rtk_lines(gnss: GnssReport) -> list[str]:
         f"  default_horizontal_sigma_m: {horizontal:.2f}  # {said}",
         f"  default_vertical_sigma_m: {vertical:.2f}  # guess: likewise, {seen_m[1]:.3f} m",
     ]
+
+
+def _uneven_lines(gnss: GnssReport) -> list[str]:
+    """What uneven stamps are off by along the way, where that is more than the fixes are taken for."""
+    default = GnssConfig()
+    taken_m = _RTK_M[0] if _rtk_lines(gnss) else default.default_horizontal_sigma_m
+    if gnss.reported_sigma_m:
+        taken_m = max(*gnss.reported_sigma_m[:2], default.min_horizontal_sigma_m)
+    if gnss.uneven is None or gnss.uneven.along_m <= taken_m:
+        return []
+    return [f"  min_horizontal_sigma_m: {gnss.uneven.along_m:.2g}  # guess: {gnss.uneven.said}"]
 
 
 def _velocities(inspection: Inspection) -> Iterator[list[str]]:

@@ -97,7 +97,14 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
     if kind == "gnss_velocity" and late is not None and late[0] < fixes_late_s - MOST_ON_ITS_WAY_S:
         lines.append(f"  min_sigma_mps: {_FILTERED_SIGMA_MPS}  # guess: so late, it is filtered, and its error lasts")
     if kind == "gnss":
-        lines.append(f"  stamp_sigma_s: {sigma_s:.2f}  # guess: {_STAMPS}")
+        hinted = next((r.hinted_s for r in inspection.gnss if r.topic.partition(" ")[0] == topic and r.hinted_s), None)
+        said = (
+            ""
+            if hinted is None
+            else f"; what the IMU feels hints at {hinted[0]:+.2f} +- {hinted[1]:.2f} s, not clearly"
+        )
+        sigma_s = max(sigma_s, abs(hinted[0]) if hinted else 0.0)
+        lines.append(f"  stamp_sigma_s: {sigma_s:.2f}  # guess: {_STAMPS}{said}")
     return lines
 
 

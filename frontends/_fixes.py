@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Deficiencies of fixes: positions that a driver repeats, stamps that it truncates, noise that a receiver understates."""
+"""Deficiencies of fixes: positions that a driver repeats, stamps that it truncates or makes as it receives, noise that a receiver understates."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.config import GnssConfig
 from graphloc.frames import Array, Datum, Geodetic
-from graphloc.measurements import GnssPosition
+from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.time import NS_PER_S, stamps_of
 from graphloc.white_noise import white_noise_of_thirds
 
@@ -19,6 +20,12 @@ _HELD_S = 2.5
 _OFTEN, _CUT = 0.2, 0.6  # shares of a sensor's messages, held or at a stamp again, from which a line is due
 _AT_ONCE, _BURST_S = 0.1, 0.3  # of the mean step: within a burst; bursts that are closer than that are left alone
 _FAST_S, _SLOW_S, _EVEN, _FEWEST = 0.25, 1.5, 0.2, 100  # steps: motion hides in none, in few, how even, how many tell
+_STEADY, _ENOUGH, _MEASURED = (
+    0.5,
+    30,
+    0.5,
+)  # of stamps: how even steps are, how many tell, what part of them shows in the places
+_USUALLY = 90  # percentile of the speed, at which what stamps are off counts
 _UNSTEADY_MPS2 = 4.0  # of slow ones, twice what a craft's acceleration changes by from step to step, most of the time
 _STORED_M, _ANY_MPS = 100.0, 50.0  # how far the first fixes are off the rest, and what no craft's speed is
 STORED = "a position that the receiver had stored: it repeats it from the first fix on, and the next one is far off"
@@ -136,6 +143,69 @@ def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConf
         return []
     said = f"{sensor}: consecutive fixes scatter by {found:.2f} m but claim a sigma of {claimed:.2f} m"
     return [f"{said}: set sigma_scale: {found / reported:.1f}"]
+
+
+def uneven_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConfig) -> list[str]:
+    """Return a line if fixes are stamped so unevenly that they are off along the way by far more than they claim."""
+    if len(fixes) < _ENOUGH:
+        return []
+    moments = {m.stamp_ns: m for m in sorted(fixes, key=lambda m: (m.stamp_ns, m.seq))}
+    places = world_from_fixes(list(moments.values()), Datum(fixes[0].position))[:, :2]
+    found = uneven(np.array(list(moments)), places)
+    reported = float(np.sqrt(np.median([np.diagonal(m.cov_enu_m2)[:2] for m in fixes], axis=0).max()))
+    claimed = max(config.sigma_scale * reported, config.min_horizontal_sigma_m)
+    if found is None or found.along_m < SCATTERS * claimed:
+        return []
+    said = f"{sensor}: its {found.said}, more than its sigma of {claimed:.2f} m"
+    return [f"{said}: set min_horizontal_sigma_m: {found.along_m:.2g}"]
+
+
+class Uneven(NamedTuple):
+    """By how much stamps of fixes are off even times, s, 1 sigma, and the speed, m/s, at which that counts."""
+
+    stamps_s: float
+    speed_mps: float
+
+    @property
+    def along_m(self) -> float:
+        """What it makes along the way, m, 1 sigma."""
+        return self.stamps_s * self.speed_mps
+
+    @property
+    def said(self) -> str:
+        """It in words."""
+        return (
+            f"stamps are uneven by {self.stamps_s:.3f} s, as of fixes that are stamped when they come in: {self.along_m:.2f} m "
+            f"at {self.speed_mps:.1f} m/s"
+        )
+
+
+def uneven(stamps_ns: NDArray[np.int64], p_m: Array) -> Uneven | None:
+    """Return how unevenly a receiver's fixes are stamped; None where few tell, or where they were measured when their stamps say so.
+
+    A receiver measures at even times. A driver that stamps what comes in adds what each message took, which a speed turns into metres.
+    Stamps that are right though uneven are told by the places: these are as uneven, times the velocity.
+
+    Args:
+        stamps_ns: (N,), increasing. p_m: (N, 2) or more columns, east, north.
+    """
+    t = (stamps_ns - stamps_ns[:1]) / NS_PER_S
+    steps = np.diff(t)
+    if len(steps) < _ENOUGH:
+        return None
+    usual = float(np.median(steps))
+    steady = np.abs(steps - usual) < _STEADY * usual
+    good = steady[:-2] & steady[1:-1] & steady[2:]
+    if good.sum() < _ENOUGH:
+        return None
+    thirds = np.diff(t, n=3)[good]
+    v = ((p_m[3:, :2] - p_m[:-3, :2]) / (t[3:] - t[:-3])[:, None])[good]
+    by_stamps, by_places = v * thirds[:, None], np.diff(p_m[:, :2], n=3, axis=0)[good]
+    power = float((by_stamps**2).sum())
+    if power == 0.0 or float((by_stamps * by_places).sum()) > _MEASURED * power:
+        return None
+    speed = float(np.percentile(np.hypot(v[:, 0], v[:, 1]), _USUALLY))
+    return Uneven(float(white_noise_of_thirds(thirds)), speed)
 
 
 def scatter_m(stamps_ns: NDArray[np.int64], p_m: Array) -> float | None:

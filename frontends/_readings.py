@@ -267,7 +267,7 @@ def reject_repeats(readings: Readings) -> list[LedgerRow]:
 
 
 def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop fixes that a driver only repeats; warn of that, of truncated stamps, and of claimed noise that is far too small."""
+    """Drop fixes that a driver only repeats; warn of that, of truncated or uneven stamps, and of claimed noise that is far too small."""
     if isinstance(readings.config, (GnssConfig, CompassConfig, VelocityConfig, BodyVelocityConfig)):
         warnings += _fixes.stamp_warning(readings.sensor, readings.stamps())
     if not isinstance(readings.config, GnssConfig):
@@ -278,6 +278,7 @@ def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
     warnings += _fixes.height_warning(readings.sensor, fixes)
     warnings += _fixes.scatter_warning(readings.sensor, fixes, readings.config)
+    warnings += _fixes.uneven_warning(readings.sensor, fixes, readings.config)
     return rows
 
 

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 from graphloc.config import SlowErrorConfig
+from graphloc.frontends._fixes import Uneven
 from graphloc.frontends.nmea import SPEEDS
 from graphloc.plain import plain
 
@@ -127,8 +128,10 @@ class GnssReport:
         white_m: the horizontal scatter, where no motion is in it: fixes come fast, or scatter by more than a craft would.
         spans_s: time from its first fix to its last. late_s: what should be added to its stamps by the accelerometer, and
             1 sigma; None where that does not tell. late_by: whose motion told so: its own, or that of a velocity of the same device.
+        hinted_s: likewise, where that is likelier than none and not clear.
         frozen, stored: warning where it repeats one position while the vessel moves, or one of before the run; '' where it does not.
         wander: by how much their error changes along the way, by `wander_by`, wheels or a velocity; empty where these do not tell.
+        uneven: how unevenly its fixes are stamped; None where these tell when each was measured.
         apart_m: by how much it and `apart_from`, the receiver it agrees with best, wander against each other, 1 sigma of an axis.
         without_height: fixes without one. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
@@ -156,6 +159,8 @@ class GnssReport:
     spans_s: float = 0.0
     late_s: tuple[float, float] | None = None
     late_by: str = ""
+    hinted_s: tuple[float, float] | None = None
+    uneven: Uneven | None = None
     apart_m: float = 0.0
     apart_from: str = ""
 

@@ -18,7 +18,7 @@ from graphloc.frontends._turns import without_line
 from graphloc.time import NS_PER_S
 
 _BLOCK_S = 20.0
-_CLEAR, _LEAST_S = 4.0, 0.02  # sigmas, s
+_CLEAR, _HINT, _LEAST_S = 4.0, 2.0, 0.02  # sigmas, s
 _BY_CHANCE = 5e-3  # a few blocks that agree by chance look like many
 _APART_S, _LEAST_OF_WAY_S = 0.05, 0.1  # how closely is looked; from which it is said
 _STEPS = 3  # to an offset of a second in the sharpest turns
@@ -80,6 +80,11 @@ class MotionOffset(NamedTuple):
     value_s: float
     sigma_s: float
     clear: bool
+
+    @property
+    def hinted(self) -> bool:
+        """Whether it is likelier than none, though not clearly: as late as a message may be, and by more than two sigmas."""
+        return not self.clear and max(_HINT * self.sigma_s, _LEAST_OF_WAY_S) < abs(self.value_s) <= MOST_ON_ITS_WAY_S
 
     def denies(self, other: MotionOffset) -> bool:
         """Return whether another offset cannot be that of the same clock."""

@@ -45,6 +45,21 @@ def against_turning(
     return int(np.sign(together)) if abs(together) > clear else 0
 
 
+def left_of_turns(turning: Turning, at_ns: NDArray[np.int64], angle: Array, over_s: float) -> float:
+    """Return what part of the changes of an angle a turning leaves, squared: 0 where it turns as the craft does, 1 where that stands; inf where nothing tells.
+
+    Args:
+        at_ns: (N,), increasing. angle: (N,) rad, unwrapped. over_s: as for `against_turning`.
+    """
+    at, own, turned = _beside(turning, at_ns, angle)
+    if len(at) < 20:
+        return np.inf
+    step = max(1, round(over_s / max(float(np.median(np.diff(at))), 1e-3)))
+    a, b = (v[step:] - v[:-step] for v in (own, turned))
+    power = float((a**2).sum())
+    return float(((a - b) ** 2).sum()) / power if power > 0.0 else np.inf
+
+
 def follows_turning(turning: Turning | None, at_ns: NDArray[np.int64], yaw: Array) -> bool:
     """Return whether a heading turns as the gyroscope does, by far more than the two differ.
 

@@ -458,7 +458,10 @@ def _timed_fixes(
                 candidates[stream.topic] = said
     known = {topic: found for topic, found in candidates.items() if found is not None and found.clear}
     by = min(known, key=lambda topic: known[topic].sigma_s, default="")
-    return replace(gnss, late_s=_clearly(known.get(by)), late_by=by)
+    hinted = own_late if own_late is not None and own_late.hinted and not known else None
+    return replace(
+        gnss, late_s=_clearly(known.get(by)), late_by=by, hinted_s=(hinted.value_s, hinted.sigma_s) if hinted else None
+    )
 
 
 def _beside_motion(

@@ -347,6 +347,17 @@ def test_a_turned_heading_may_be_a_turned_imu(right: app.Run) -> None:
     assert "imu" not in _suggestion(("gnss", "x"), found, {}, right.recording, right.config).action
 
 
+def test_an_antenna_elsewhere_may_be_an_imu_elsewhere(right: app.Run) -> None:
+    """Of an IMU 3 m ahead whose place was left at 0, an antenna that was right was said to be 3 m off: set so, the origin is the IMU."""
+    found = OffsetEstimate(value=-3.0, sigma=0.08, drop=100.0)
+    imu = right.config.sensors["imu"]
+    for xyz_m, said in (((0.0, 0.0, 0.0), True), ((3.0, 0.0, 0.0), False)):
+        moved = imu.model_copy(update={"mount": imu.mount.model_copy(update={"xyz_m": xyz_m})})
+        config = right.config.model_copy(update={"sensors": {**right.config.sensors, "imu": moved}})
+        action = _suggestion(("gnss", "x"), found, {}, right.recording, config).action
+        assert ("it is the IMU that sits elsewhere" in action and "sensors.imu.mount.xyz_m" in action) is said
+
+
 def test_an_offset_of_three_and_a_half_sigmas_does_not_fit(right: app.Run) -> None:
     """It read 'fits, within 0.019 s'."""
     said = [

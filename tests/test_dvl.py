@@ -99,15 +99,17 @@ def logs_of(config: VesselConfig) -> list[BodyVelocityConfig]:
     return [sensor for sensor in config.sensors.values() if isinstance(sensor, BodyVelocityConfig)]
 
 
-def driven(make: Messages, msgtype: str, water: slice = slice(0), sign: float = 1.0, frame: str = "dvl") -> list[Item]:
-    """A drive with a Doppler log in place of wheels; some of its messages are through water."""
+def driven(
+    make: Messages, msgtype: str, water: slice = slice(0), sign: float = 1.0, frame: str = "dvl", drift_mps: float = 0.0
+) -> list[Item]:
+    """A drive with a Doppler log in place of wheels; some of its messages are through water. It may drift, ever faster, to port."""
     items: list[Item] = []
     logs = [(at, m) for topic, at, m in drive(make) if topic == "/wheel/odom"]
     through = np.ones(len(logs), dtype=int)
     through[water] = 2
     for k, ((at, m), mode) in enumerate(zip(logs, through.tolist(), strict=True)):
         bad = {"num_good_beams": 1} if k == 0 and mode == 2 else {}
-        v = (sign * m.twist.twist.linear.x, 0.0, 0.0)
+        v = (sign * m.twist.twist.linear.x, drift_mps * k / len(logs), 0.0)
         items.append(
             ("/dvl", at, said(make, msgtype, header=make.header(at, frame), **(fields(make, msgtype, v, mode) | bad)))
         )
@@ -183,6 +185,31 @@ def test_a_frame_of_tf_whose_z_is_up_is_not_the_logs(down: bool, tmp_path: Path)
     wanted = Rotation.from_euler("ZX", [30.0, 180.0], degrees=True).as_matrix()
     np.testing.assert_allclose(log.mount.R_body_sensor, wanted, atol=1e-3)
     assert log.mount.xyz_m == (1.0, 0.5, -0.75)
+
+
+def test_one_that_may_sit_at_45_deg_tells_how_the_imu_sits_only_where_nothing_else_moves(tmp_path: Path) -> None:
+    make = Messages(2)
+    for name, without, source in (("both", "", "/fix"), ("alone", "/fix", "/dvl")):
+        (tmp_path / name).mkdir()
+        items = [item for item in driven(make, GENERAL[0]) if item[0] != without]
+        found, _, _ = look(tmp_path / name, items, make)
+        assert f"yaw by the motion of {source}:" in found.imus[0].mount.evidence
+
+
+def test_tf_turns_what_it_says_to_ahead(tmp_path: Path) -> None:
+    """It sits at 90 deg: ahead is its y, and what it drifts by in x is none."""
+    make = Messages(2)
+    turned = Rotation.from_euler("ZX", [90.0, 180.0], degrees=True)
+    items = [item for item in driven(make, GENERAL[0], drift_mps=9.0) if item[0] != "/fix"]
+    for topic, _, m in items:
+        if topic == "/dvl":
+            x, y, z = turned.inv().apply([m.velocity.x, m.velocity.y, 0.0])
+            m.velocity = make.vector((x, y, z))
+    edges = [("base_link", "dvl", (0, 0, 0), turned.as_quat().tolist())]
+    found, _, _ = look(tmp_path, [("/tf_static", START_NS, make.transforms(edges)), *items], make)
+    evidence = found.imus[0].mount.evidence
+    assert "yaw by the motion of /dvl: 0 deg" in evidence.replace("-0 deg", "0 deg")
+    assert float(evidence.partition("coherence ")[2].partition(")")[0]) > 0.95
 
 
 def test_one_that_never_locked_is_no_crash(tmp_path: Path) -> None:

@@ -82,6 +82,45 @@ def test_fixes_that_move_or_stand_are_kept(every: int, tmp_path: Path) -> None:
     assert recording.warnings == ()
 
 
+def uneven_fixes(stamped_s: float, measured_s: float = 0.0, seconds: int = 60) -> list[Item]:
+    """A car that brakes and turns at 6 to 14 m/s; its fixes at 5 Hz are measured and stamped that far, 1 sigma, about even times."""
+    rng = np.random.default_rng(4)
+    fine = np.arange(0.0, seconds + 1.0, 0.01)
+    v, turned = 10.0 + 4.0 * np.sin(0.3 * fine), 1.5 * np.sin(0.2 * fine)
+    way = np.cumsum(0.01 * v * np.exp(1j * turned))
+    items: list[Item] = []
+    for k in range(1, 5 * seconds):
+        measured = k / 5.0 + measured_s * rng.normal()
+        stamp_ns = START_NS + round((measured + stamped_s * rng.normal()) * S)
+        at = np.interp(measured, fine, way)
+        place = np.array([[at.real, at.imag, 0.0]]) + 0.015 * rng.normal(size=3)
+        lla = DATUM.geodetic_from_enu(place)[0]
+        items.append(
+            ("/fix", stamp_ns, MAKE.fix(stamp_ns, lla[0], lla[1], lla[2], covariance=(0.02**2 * np.eye(3)).ravel()))
+        )
+    return items
+
+
+def test_fixes_that_are_stamped_when_they_come_in_are_not_good_to_their_centimetres(tmp_path: Path) -> None:
+    """10 ms at 13.8 m/s, the 90 % point of the speed: online, heading and place were outside their bounds half of the time."""
+    (line,) = read(tmp_path, uneven_fixes(0.01)).warnings
+    assert line.startswith("gnss: its stamps are uneven by 0.01")
+    draft = draft_config(inspect_bag(tmp_path / "run"))
+    (drafted,) = (row for row in draft.splitlines() if "min_horizontal_sigma_m" in row)
+    floor_m = float(drafted.split()[1])
+    assert floor_m == pytest.approx(0.138, rel=0.15)
+    (tmp_path / "again").mkdir()
+    assert read(tmp_path / "again", uneven_fixes(0.01), min_horizontal_sigma_m=floor_m).warnings == ()
+
+
+@pytest.mark.parametrize(("stamped_s", "measured_s"), [(0.0, 0.01), (0.0, 0.0), (0.001, 0.0)])
+def test_stamps_that_tell_when_a_fix_was_measured_are_believed(
+    stamped_s: float, measured_s: float, tmp_path: Path
+) -> None:
+    assert not any("uneven" in said for said in read(tmp_path, uneven_fixes(stamped_s, measured_s)).warnings)
+    assert "min_horizontal_sigma_m" not in draft_config(inspect_bag(tmp_path / "run"))
+
+
 def stored_first(
     away_m: float, *, count: int = 100, silent_s: int = 0, noise_m: float = 0.0, back: bool = False
 ) -> list[Item]:

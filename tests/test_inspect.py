@@ -13,7 +13,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, ImuConfig, VesselConfig, load_config
-from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic, rotation_from_rpy_deg
 from graphloc.frontends._assess_velocity import EITHER, axes_of, velocity_report
 from graphloc.frontends._reports import BODY_AXES, EAST_AXES
 from graphloc.frontends._source import Bag, RawMessage
@@ -225,6 +225,21 @@ def test_without_gravity_the_motion_tells_the_yaw(yaw_deg: float, upright: bool,
     for topic, _, message in items:
         if topic == "/imu":
             message.linear_acceleration.z -= G if upright else -G
+    found, config, _ = look(tmp_path, items, make)
+    assert found.imus[0].gravity == "removed"
+    np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, mount, atol=1e-6)
+
+
+@pytest.mark.parametrize("rpy_deg", [(90.0, 0.0, 0.0), (-90.0, 0.0, 90.0), (0.0, 90.0, 0.0), (180.0, 90.0, 0.0)])
+def test_without_gravity_the_turns_tell_which_axis_is_up(rpy_deg: tuple[float, float, float], tmp_path: Path) -> None:
+    """A phone on a dashboard stands upright: taken as level, the vessel lay on its side, and the heading was 66 deg off."""
+    make = Messages(2)
+    mount = rotation_from_rpy_deg(np.array(rpy_deg))
+    items = drive(make, mount)
+    for topic, _, message in items:
+        if topic == "/imu":
+            a = message.linear_acceleration
+            a.x, a.y, a.z = np.array([a.x, a.y, a.z]) - mount.T @ [0.0, 0.0, G]
     found, config, _ = look(tmp_path, items, make)
     assert found.imus[0].gravity == "removed"
     np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, mount, atol=1e-6)

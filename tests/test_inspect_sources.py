@@ -665,6 +665,28 @@ def test_fixes_that_are_stamped_late_get_an_offset(late_s: float, tmp_path: Path
     assert config.sensors["gnss"].stamp_sigma_s >= 0.05  # what is left is estimated with the run
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.2])
+def test_fixes_that_may_be_stamped_late_are_given_as_much_to_find(late_s: float, tmp_path: Path) -> None:
+    """In a minute the IMU tells 0.2 s by three sigmas, no more: no offset is drafted, and a sigma of 0.05 s would not reach so far."""
+    make = Messages(2)
+    items = [item for item in drive(make, seconds=60, noise_m=0.1, status=0, sigma_m=1.0) if item[0] != "/wheel/odom"]
+    late_ns = round(late_s * S)
+    for k, (topic, at, m) in enumerate(items):
+        if topic == "/fix":
+            later = make.fix(at + late_ns, m.latitude, m.longitude, m.altitude, 0, np.eye(3).ravel())
+            items[k] = (topic, at + late_ns, later)
+    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    gnss = config.sensors["gnss"]
+    assert isinstance(gnss, GnssConfig)
+    assert gnss.time_offset_s == 0.0
+    assert found.gnss[0].late_s is None
+    if late_s == 0.0:
+        assert gnss.stamp_sigma_s == 0.05
+        return
+    assert gnss.stamp_sigma_s == pytest.approx(late_s, abs=0.1)
+    assert "what the IMU feels hints at -0." in text
+
+
 @pytest.mark.parametrize(("late_s", "way_s", "noise_m"), [(0.4, 0.02, 1.0), (0.4, 0.4, 1.0), (0.8, 0.02, 1.5)])
 def test_a_velocity_of_the_receiver_tells_how_late_its_noisy_fixes_are(
     late_s: float, way_s: float, noise_m: float, tmp_path: Path

@@ -101,6 +101,13 @@ def _of_one_antenna(sensor: str, recording: Recording, config: VesselConfig) -> 
     return [n for n in others if np.array_equal(mount_of(n, config.sensors[n], recording.mounts)[0], place)]
 
 
+def _imu_at_origin(recording: Recording, config: VesselConfig) -> str:
+    """Return the IMU whose place in the body is not set; empty where it is. Fixes and an IMU tell how far apart they are, and no more."""
+    imu = "" if recording.imu is None else recording.imu.sensor
+    unset = imu in config.sensors and imu not in recording.mounts and not any(config.sensors[imu].mount.xyz_m)
+    return imu if unset else ""
+
+
 def _suggestion(
     name: Name, found: OffsetEstimate, others: dict[Name, OffsetEstimate], recording: Recording, config: VesselConfig
 ) -> Suggestion:
@@ -119,6 +126,10 @@ def _suggestion(
     if name[1] == "yaw" and recording.imu is not None:
         # Where fixes and the IMU's accelerations say the heading, the IMU's own yaw in the craft is in it, which is no state.
         action += f"; or sensors.{recording.imu.sensor}.mount.rpy_deg[2] is off, the other way"
+    if name[1] in _AXIS and (imu := _imu_at_origin(recording, config)):
+        action += (
+            f"; or it is the IMU that sits elsewhere, the other way: measure sensors.{imu}.mount.xyz_m, too, which is 0"
+        )
     if others:
         either = "; or ".join(_instead(n, e, recording, config) for n, e in others.items())
         action += f"; this run cannot tell it from {either}"

@@ -204,8 +204,8 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
         if off_m > 0.0:
             yield Reason(
                 trust=Trust.WITH_CARE if off_m > bound_m else Trust.YES,
-                text=f"The antenna of {name} looks {off_m:.2f} m away from where mount.xyz_m has it (Calibration, below): the track is off "
-                f"by as much, which its bounds of {bound_m:.2f} m (median) do not include.",
+                text=f"The antenna of {name} looks {off_m:.2f} m away from where mount.xyz_m has it, or the IMU does (Calibration, below): "
+                f"the track is off by up to as much, which its bounds of {bound_m:.2f} m (median) do not include.",
             )
         elif name not in data.recording.mounts and not any(data.config.sensors[name].mount.xyz_m[:2]):
             known = [SIGMAS_95 * c.sigma for c in checks if c.key in keys]
