@@ -20,11 +20,8 @@ _HELD_S = 2.5
 _OFTEN, _CUT = 0.2, 0.6  # shares of a sensor's messages, held or at a stamp again, from which a line is due
 _AT_ONCE, _BURST_S = 0.1, 0.3  # of the mean step: within a burst; bursts that are closer than that are left alone
 _FAST_S, _SLOW_S, _EVEN, _FEWEST = 0.25, 1.5, 0.2, 100  # steps: motion hides in none, in few, how even, how many tell
-_STEADY, _ENOUGH, _MEASURED = (
-    0.5,
-    30,
-    0.5,
-)  # of stamps: how even steps are, how many tell, what part of them shows in the places
+# Of stamps: how even steps are, how many tell, what part of them shows in the places.
+_STEADY, _ENOUGH, _MEASURED = 0.5, 30, 0.5
 _USUALLY = 90  # percentile of the speed, at which what stamps are off counts
 _UNSTEADY_MPS2 = 4.0  # of slow ones, twice what a craft's acceleration changes by from step to step, most of the time
 _STORED_M, _ANY_MPS = 100.0, 50.0  # how far the first fixes are off the rest, and what no craft's speed is

@@ -6,13 +6,15 @@ import gtsam
 import numpy as np
 
 from graphloc import app, keys
-from graphloc.build import Problem, build_graph, make_problem, state_keys, thinned
+from graphloc.build import Problem, StartPrior, build_graph, make_problem, state_keys, thinned
 from graphloc.eval.simulate import find_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
 from graphloc.solve._align import align
 from graphloc.solve._decide import Stage, decisions, weigh
 from graphloc.solve._grow import grow
+from graphloc.solve._imu_mount import by_turn
+from graphloc.solve._linearised import sparse_rows
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._start import solve_start
 from graphloc.solve._stretch import past_at, solve_stretch, weak_prior
@@ -20,7 +22,7 @@ from tests import tagfactory
 
 
 @cache
-def grown() -> tuple[Problem, gtsam.Values]:
+def grown() -> tuple[Problem, gtsam.Values, StartPrior]:
     less = {"imu_hz": "50", "gnss_hz": "2", "compass_hz": "4", "lidar_hz": "0", "camera_hz": "0"}
     true = simulate(find_scenario("dock-floating-optimal", {**less, "duration_s": "30", "route_s": "30"}), 1)
     run, _ = tagfactory.sighted(true, rate_hz=3.0)
@@ -30,11 +32,11 @@ def grown() -> tuple[Problem, gtsam.Values]:
     few = thinned(problem)
     values, prior, known, *_ = solve_start(few.problem, align(problem), lambda *_: None)
     grow(few.problem, values, prior, known, lambda *_: None)
-    return problem, few.filled(problem, values)
+    return problem, few.filled(problem, values), prior
 
 
 def test_a_stretch_may_end_anywhere() -> None:
-    problem, values = grown()
+    problem, values, _ = grown()
     last = len(problem.timeline) - 1
     seen = next(s for s in problem.streams if s.name == "tags")
     for stop in (int(k) for k in seen.state[len(seen.state) // 2 :][:6]):
@@ -49,7 +51,7 @@ def test_a_stretch_may_end_anywhere() -> None:
 
 def test_the_past_says_of_a_state_what_the_whole_stretch_says_without_what_comes_after() -> None:
     """Gaussian sums are exact: past and later measurements together are the whole, for each state and for sums of them."""
-    problem, values = grown()
+    problem, values, _ = grown()
     slow_of, last = problem.timeline.slow_of, len(problem.timeline) - 1
     first, stop = 60, last - 40
     verdicts = weigh(problem, values, first=first, last=stop, stage=Stage.FINAL)
@@ -90,3 +92,16 @@ def _joint(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, names: list[
     jacobian, _ = linear.jacobian(gtsam.Ordering(names + others))
     size = 6 + sum(len(np.atleast_1d(values.atVector(key))) for key in names[1:])
     return np.asarray(np.linalg.inv(jacobian.T @ jacobian)[:size, :size])
+
+
+def test_sightings_do_not_turn_with_the_mount_of_the_imu() -> None:
+    """Beside the IMU's links, of nine rows each, only its levelling does; leaves come before biases in the columns."""
+    problem, values, prior = grown()
+    last = len(problem.timeline) - 1
+    assert prior.level is not None
+    verdicts = weigh(problem, values, first=0, last=last, stage=Stage.FINAL)
+    graph, guess = build_graph(problem, values, decisions(verdicts), 0, last, prior)
+    assert sum(keys.is_leaf(int(key)) for key in np.array(list(guess.keys()), dtype=np.uint64)) > 20
+    J, _ = sparse_rows(graph, guess)
+    turned = np.flatnonzero(by_turn(J, last + 1).any(axis=1))
+    assert (turned >= 9 * last).sum() == 2

@@ -44,8 +44,8 @@ class ImuConfig(SensorConfig):
     gyro_bias_sigma_dps: Positive = 2.0
     """Turn-on gyroscope bias, 1 sigma, deg/s, before the start alignment has measured it."""
     mount_sigma_deg: NonNegative = 1.0
-    """Unknown attitude error of its mount, 1 sigma, each axis, deg. Offline it is estimated with the run, and the bounds include what is
-    left of it. 0: the IMU's axes are those of the vessel by definition, or were calibrated to a tenth of a degree."""
+    """Unknown attitude error of its mount, 1 sigma, each axis, deg. Offline its yaw is estimated with the run, and the bounds include
+    what is left of it. 0: the IMU's axes are those of the vessel by definition, or were calibrated to a tenth of a degree."""
     adapt_noise: bool = True
     """Raise the noise (never lower it, and with a warning) if the run contradicts it, or the IMU's own residuals do."""
     max_gap_s: Positive = 0.5

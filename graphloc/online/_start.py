@@ -9,6 +9,7 @@ a heading from travel alone), the window begins its own length ago, with the pri
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import gtsam
@@ -233,11 +234,11 @@ def _before(result: BatchResult, k: int) -> BeforeStart | None:
     """Return what was done to state `k`, the first of the window; at the first data nothing has been done yet."""
     if not k:
         return None
-    try:
+    slow = by_mount = None
+    with suppress(RuntimeError, np.linalg.LinAlgError):  # not determined; the window that follows says what it can
         slow = unmodelled(result)
+    with suppress(RuntimeError, np.linalg.LinAlgError):
         by_mount = followed_before(result.problem, result.values, result.verdicts, result.prior, k)
-    except (RuntimeError, np.linalg.LinAlgError):  # not determined; the window that follows says what it can
-        return None
     return BeforeStart(None if slow is None else Unmodelled(slow.rotation[k], slow.velocity[k]), by_mount)
 
 

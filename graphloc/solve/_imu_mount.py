@@ -12,6 +12,9 @@ What no change of the states explains, c~ = c - J argmin |J X - c|, carries the 
 
 and the states follow by X m: what is not known of m widens their covariance (a consider parameter, Schmidt 1966). Without it, fixes
 of centimetres tell the heading of an IMU to some tenths of a degree, and state that of the vessel to as much.
+
+Of m only the yaw is taken from the run. Roll and pitch show in how an antenna swings about the IMU, as its lever arm does, in
+which decimetres are usual: a height that is 0.4 m wrong became a mount that is tilted by 4 deg, and a place 0.15 m off.
 """
 
 from __future__ import annotations
@@ -32,20 +35,22 @@ from graphloc.solve._linearised import linearised, normal_solver, root_weights, 
 from graphloc.solve._passes import Settled, cost_as_configured, settle
 
 _ROUNDS = 3
-_MATTERS = 0.5  # sigmas of the mount: less is in the bounds
-_MOST = 5.0  # sigmas: what speaks for more is another error, as a lever arm that is wrong by metres
+_MATTERS, _TOLD = 0.5, 1.5  # sigmas of the mount, and of what is known of it: less is in the bounds
+_MOST = 5.0  # sigmas of the mount: what speaks for more is another error
 
 
 class MountError(NamedTuple):
     """What a run says of the mount of its IMU, beyond how it was solved, and how its N states follow.
 
     Attributes:
-        turn_rad: (3,) most probable turn, body axes. cov: (3, 3) of it, rad^2.
+        yaw_rad: most probable turn about the body's z. sigma_rad: of it.
+        mean_square: (3,) of the turn about each axis, body axes, rad^2.
         pose: (N, 6, 3) change of each pose (rotation, translation; body axes) per turn. velocity: (N, 3, 3) the same, world axes.
     """
 
-    turn_rad: Array
-    cov: Array
+    yaw_rad: float
+    sigma_rad: float
+    mean_square: Array
     pose: Array
     velocity: Array
 
@@ -57,15 +62,11 @@ class MountError(NamedTuple):
         """
         turned, moved = R @ self.pose[:, :3], R @ (self.pose[:, 3:] - skew(lever_m) @ self.pose[:, :3])
         by = np.concatenate([moved, turned], axis=1)
-        return np.asarray(by @ self._beyond() @ by.transpose(0, 2, 1))
+        return np.asarray((by * self.mean_square) @ by.transpose(0, 2, 1))
 
     def velocity_covariance(self) -> Array:
         """Return what it adds to the covariance (N, 3, 3) of the velocity, world axes."""
-        return np.asarray(self.velocity @ self._beyond() @ self.velocity.transpose(0, 2, 1))
-
-    def _beyond(self) -> Array:
-        """Return the mean square (3, 3) of the mount's error against how the run was solved."""
-        return np.asarray(self.cov + np.outer(self.turn_rad, self.turn_rad))
+        return np.asarray((self.velocity * self.mean_square) @ self.velocity.transpose(0, 2, 1))
 
 
 def mount_sigma_rad(problem: Problem) -> float:
@@ -87,20 +88,22 @@ def mount_error(
     sigma = mount_sigma_rad(problem)
     if sigma == 0.0:
         return None
-    n, nodes = len(problem.timeline), len(problem.timeline.slow_stamps_ns)
-    told = follows = _followed(*sparse_rows(graph, values), n, nodes)
+    n = len(problem.timeline)
+    told = follows = _followed(*sparse_rows(graph, values), n)
     if any(stream.left_out is not None for stream in problem.streams):
         # The graph takes their drift for motion, which would speak for a mount as if it were none.
         rows = linearised(*with_left_out(problem, values), verdicts, prior)
         root = root_weights(rows, -rows.b)
-        told = _followed(diags_array(root) @ rows.J, root * rows.b, n, nodes)
-    cov = np.asarray(np.linalg.inv(told.left.T @ told.left + np.eye(3) / sigma**2), dtype=np.float64)
+        told = _followed(diags_array(root) @ rows.J, root * rows.b, n)
+    cov = np.linalg.inv(told.left.T @ told.left + np.eye(3) / sigma**2)
     turn = cov @ (told.left.T @ told.b - problem.imu_turn_rad / sigma**2)
     X = follows.states
-    if not (np.isfinite(cov).all() and np.isfinite(X).all()):
+    if not (np.isfinite(cov).all() and np.isfinite(turn).all() and np.isfinite(X).all()):
         raise RuntimeError("not finite")
+    yaw, var = float(turn[2]), float(cov[2, 2])
+    mean_square = np.array([sigma**2, sigma**2, var + yaw**2])
     # Keys are sorted by letter: velocities and poses come last.
-    return MountError(turn, cov, X[-6 * n :].reshape(n, 6, 3), X[-9 * n : -6 * n].reshape(n, 3, 3))
+    return MountError(yaw, var**0.5, mean_square, X[-6 * n :].reshape(n, 6, 3), X[-9 * n : -6 * n].reshape(n, 3, 3))
 
 
 def followed_before(
@@ -114,7 +117,7 @@ def followed_before(
         return None
     rows, n = linearised(problem, values, verdicts, prior), len(problem.timeline)
     before = rows.stamps_ns < problem.timeline.stamps_ns[k]
-    J, c = diags_array(root_weights(rows, -rows.b)) @ rows.J, _by_turn(rows.J, n, len(problem.timeline.slow_stamps_ns))
+    J, c = diags_array(root_weights(rows, -rows.b)) @ rows.J, by_turn(rows.J, n)
     J, c = J[before], c[before]
     used = abs(J).sum(axis=0) > 0.0
     X = np.zeros((len(used), 3))
@@ -134,30 +137,31 @@ class _Followed(NamedTuple):
     b: Array
 
 
-def _followed(J: Any, b: Array, n: int, nodes: int) -> _Followed:
-    """Return how the states follow, n of them with so many slow nodes."""
-    c = _by_turn(J, n, nodes)
+def _followed(J: Any, b: Array, n: int) -> _Followed:
+    """Return how the n states follow."""
+    c = by_turn(J, n)
     X = -normal_solver(J)(J.T @ c)
     return _Followed(X, c + J @ X, b)
 
 
-def _by_turn(J: Any, n: int, nodes: int) -> Array:
-    """Return c (rows, 3). The factors of the IMU between the n states come first in J (rows, columns).
+def by_turn(J: Any, n: int) -> Array:
+    """Return c (rows, 3) of the module's text. The factors of the IMU between the n states come first in J (rows, columns), and poses last.
 
-    Biases come first in the columns, and poses last, as keys are sorted by letter.
+    Beside these the levelling alone has an attitude and a bias.
     """
     U = np.zeros((J.shape[1], 3))
     U[-6 * n :].reshape(n, 6, 3)[:, :3] = np.eye(3)
-    c = np.asarray(J @ U)
-    levelled = abs(J[9 * (n - 1) :, : 6 * nodes]).sum(axis=1) > 0.0  # no other factor has an attitude and a bias
-    c[9 * (n - 1) :][~np.asarray(levelled).ravel()] = 0.0
+    c, links = np.asarray(J @ U), 9 * (n - 1)
+    biases = np.flatnonzero(abs(J[:links, : -9 * n]).sum(axis=0))  # all that the IMU has beside poses and velocities
+    levelling = np.asarray(abs(J[links:, biases]).sum(axis=1)).ravel() > 0.0
+    c[links:][~levelling] = 0.0
     return c
 
 
 def with_mount_estimated(
     problem: Problem, settled: Settled, prior: StartPrior, progress: Progress, most: int
 ) -> tuple[Problem, Settled, StartPrior, MountError | None]:
-    """Return the problem with the mount of its IMU as is most probable, settled in at most `most` passes; as they are if that is near.
+    """Return the problem with the yaw of its IMU's mount as is most probable, settled in at most `most` passes; as they are if that is near.
 
     And what that says of the mount; None where it is taken as given, or not determined.
     """
@@ -170,26 +174,23 @@ def with_mount_estimated(
     def found(problem: Problem, settled: Settled, prior: StartPrior) -> MountError | None:
         try:
             return mount_error(problem, settled.graph, settled.values, settled.verdicts, prior)
-        except (RuntimeError, np.linalg.LinAlgError):
+        except (RuntimeError, np.linalg.LinAlgError, MemoryError):
             return None
 
     error, lowest = found(problem, settled, prior), np.inf
-    as_configured = problem, settled, prior, error
     for _ in range(_ROUNDS):
-        if error is None or np.abs(error.turn_rad).max() < _MATTERS * sigma:
+        if error is None or abs(error.yaw_rad) < max(_MATTERS * sigma, _TOLD * error.sigma_rad):
             break
-        if np.abs(problem.imu_turn_rad + error.turn_rad).max() > _MOST * sigma:
-            return as_configured
+        turn = np.array([0.0, 0.0, error.yaw_rad])
+        if abs(problem.imu_turn_rad + turn).max() > _MOST * sigma:
+            break
         if np.isinf(lowest):
             lowest = cost(problem, settled, prior)
-        turned, prior_there = (
-            with_imu_turned(problem, settled.values, error.turn_rad),
-            prior.with_imu_turned(error.turn_rad),
-        )
+        turned, prior_there = with_imu_turned(problem, settled.values, turn), prior.with_imu_turned(turn)
         verdicts = weigh(turned, settled.values, first=0, last=last, stage=Stage.FINAL)
         try:
             again = settle(turned, settled.values, verdicts, prior_there, progress, most)
-        except SolveError:
+        except (SolveError, MemoryError):
             break
         if not (now := cost(turned, again, prior_there)) < lowest:
             break

@@ -61,6 +61,7 @@ def solve_parts(
         assert failure is not None
         raise failure
     whole = _join(solutions, rows, warnings)
+    events = [*dict.fromkeys(event for s in solutions for event in s.stats.events), *events]
     return replace(whole, stats=replace(whole.stats, events=tuple(events)))
 
 

@@ -31,7 +31,7 @@ from graphloc.solve._health import health_over_time, misfits, since_agreed
 from graphloc.solve._imu_mount import mount_error
 from graphloc.solve._ledger import ledger_of
 from graphloc.solve._unmodelled import unmodelled
-from graphloc.solve._warnings import mount_warning, stats_of
+from graphloc.solve._warnings import mount_event, mount_warning, stats_of
 from graphloc.trajectory import Trajectory
 
 _NEAR_BERTH_M = 60.0
@@ -72,7 +72,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     limit_heading(trajectory.cov)
     since = {s.name: since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     stats = stats_of(problem, result)
-    stats = replace(stats, warnings=(*stats.warnings, *unsaid))
+    stats = replace(stats, warnings=(*stats.warnings, *unsaid), events=mount_event(result.problem))
     health, reasons = health_over_time(trajectory, since, misfits(problem, result, stats))
     ledger = ledger_of(problem, recording, result.verdicts)
     return Solution(

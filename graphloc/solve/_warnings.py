@@ -143,16 +143,27 @@ def _noisier(stream: Stream, result: BatchResult) -> float:
 
 
 def mount_warning(problem: Problem, error: MountError) -> list[str]:
-    """Say where the other sensors have the mount of the IMU far from where it is configured: a line, or none."""
-    turn = problem.imu_turn_rad + error.turn_rad
+    """Say where the other sensors have the yaw of the IMU's mount farther off than its sigma and theirs allow: a line, or none.
+
+    What is left of the turn is shrunk by its prior, and scatters by what the others take off that.
+    """
     sigma = problem.config.sensors[problem.imu.sensor].mount_sigma_rad
-    far = float(np.abs(turn).max() / sigma)
-    if far < _TURNED:
+    turn, told = float(problem.imu_turn_rad[2]) + error.yaw_rad, sigma**2 - error.sigma_rad**2
+    if told < _TOLD * sigma**2 or (sigmas := abs(turn) / float(np.sqrt(told))) < _TURNED:
         return []
-    axes = zip(("roll", "pitch", "yaw"), np.degrees(turn), np.degrees(np.sqrt(np.diagonal(error.cov))), strict=True)
-    where = ", ".join(f"{axis} {off:+.1f} +- {sigma_deg:.1f} deg" for axis, off, sigma_deg in axes)
-    said = f"{problem.imu.sensor}: the other sensors turn its mount by {far:.1f} sigmas ({where}): check its mount and theirs"
-    return [Graded(said, "mount of the IMU", far)]
+    said = f"{problem.imu.sensor}: the other sensors turn its mount by {np.degrees(turn):+.1f} +- {np.degrees(error.sigma_rad):.1f} deg of yaw"
+    kept = "" if problem.imu_turn_rad.any() else ", though it stays as configured"
+    said += f"{kept} ({sigmas:.1f} sigmas of what that may be): check its mount and theirs"
+    return [Graded(said, "mount of the IMU", sigmas)]
+
+
+def mount_event(problem: Problem) -> tuple[str, ...]:
+    """Say so where the run was solved with the mount of the IMU turned: a line, or none."""
+    turn_deg = float(np.degrees(problem.imu_turn_rad[2]))
+    name = problem.imu.sensor
+    return (
+        (f"{name}: its mount is taken as turned by {turn_deg:+.1f} deg of yaw (mount_sigma_deg)",) if turn_deg else ()
+    )
 
 
 def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
