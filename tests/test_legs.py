@@ -66,10 +66,10 @@ def legs(run: SimulatedRun) -> Solution:
 
 
 def test_legs_are_as_good_as_the_whole(run: SimulatedRun, whole: Solution, legs: Solution) -> None:
-    (said,) = legs.stats.events
+    (said,) = (event for event in legs.stats.events if "legs" in event)
     assert said.startswith("solved in 3 overlapping legs")
     assert legs.stats.warnings == whole.stats.warnings  # nothing is wrong
-    assert whole.stats.events == ()
+    assert not [event for event in whole.stats.events if "legs" in event]
     one, several = (compare_to_truth(s.trajectory, run.truth) for s in (whole, legs))
     assert several.matched == pytest.approx(one.matched, abs=1e-3)
     assert several.position_rmse_m < one.position_rmse_m + 0.03
