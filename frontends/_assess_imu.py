@@ -31,10 +31,8 @@ from graphloc.white_noise import white_noise
 # Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
 _COURSE_S, _COURSE_CLEAR, _LEFT_OF_TURNS = 12.0, 0.6, 0.5
 _UPSIDE_DOWN_DEG = 150.0
-_QUIET_S, _STANDS_S = (
-    2,
-    1.5,
-)  # quiet seconds in a row; for how long it is slow, at most, that only changes its direction
+# Quiet seconds in a row; for how long it is slow, at most, that only changes its direction.
+_QUIET_S, _STANDS_S = 2, 1.5
 # Off body z, from which gravity is said to be; about a quarter turn, by which it, or the motion, overrules tf, and how coherent.
 _TILTED_DEG, _QUARTER_DEG, _OVERRULES = 20.0, 20.0, 0.6
 _SLIGHTLY_DEG = 3.0  # off a quarter turn, from which it is said

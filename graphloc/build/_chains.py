@@ -103,7 +103,7 @@ def at_level(slow: SlowProcess, names: Sequence[int], dt_s: Array, usual: NDArra
     Args:
         names: (N,) the keys of the nodes. dt_s: (N - 1,) between them. usual: (N,).
     """
-    held = _held(slow, dt_s, usual)
+    held = _usual_information(slow, dt_s, usual)
     for n in np.flatnonzero(usual):
         yield _prior(names[int(n)], slow.sigma * np.where(slow.far_axes, np.sqrt(1.0 / held[n]), _NOTHING))
 
@@ -142,11 +142,11 @@ def standing_cost(slow: SlowProcess, path: Array, dt_s: Array) -> float:
     """
     far = slow.far_axes
     square = ((path[:, far] / slow.sigma[far]) ** 2).sum(axis=1)
-    held = _held(slow, dt_s, np.ones(len(path), dtype=bool))
+    held = _usual_information(slow, dt_s, np.ones(len(path), dtype=bool))
     return float(held @ np.log1p(square / _FAR**2)) * _FAR**2 / 2.0
 
 
-def _held(slow: SlowProcess, dt_s: Array, usual: NDArray[np.bool_]) -> Array:
+def _usual_information(slow: SlowProcess, dt_s: Array, usual: NDArray[np.bool_]) -> Array:
     """Return the information (N,) of the priors about 0 of a chain that ends at the first and last of its `usual` nodes."""
     held = np.concatenate([[0.0], dt_s / (2.0 * float(slow.time_constant_s[slow.far_axes].max()))])
     if usual.any():

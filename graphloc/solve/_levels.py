@@ -119,7 +119,7 @@ def at_usual_level(
     share = np.exp(costs.min() - costs)
     beside = np.array(levels) - usual
     others = others + np.einsum("n,ni,nj->ij", share / share.sum(), beside, beside)
-    problem = replace(problem, streams=tuple(_held(s, case, usual) for s in problem.streams))
+    problem = replace(problem, streams=tuple(_with_usual(s, case, usual) for s in problem.streams))
     verdicts = weigh(problem, moved, first=0, last=last, stage=Stage.FINAL)
     try:
         held = settle(problem, moved, verdicts, prior_there, progress, most)
@@ -226,7 +226,7 @@ def _away(slow: SlowProcess, path: Array) -> NDArray[np.bool_]:
     return np.asarray(np.linalg.norm(path[:, far] / slow.sigma[far], axis=1) > _FAR)
 
 
-def _held(stream: Stream, case: _Case, usual: Array) -> Stream:
+def _with_usual(stream: Stream, case: _Case, usual: Array) -> Stream:
     """Return it with the nodes at which its error is at the usual level, if it has one that may be far off and there is any."""
     for one, path in zip(case.streams, case.paths(), strict=True):
         if one is stream and one.slow is not None and not (away := _away(one.slow, path - usual)).all():

@@ -27,10 +27,8 @@ from graphloc.solve._stretch import copy_states, dead_reckon
 from graphloc.time import NS_PER_S, utc_text
 
 WHY = "contradicts the other sensors, which agree with each other"
-_SUSPECT, _TIMES = (
-    36.0,
-    30.0,
-)  # squares of an IMU factor that make it one; and how many times those of the window before
+# Squares of an IMU factor that make it one; and how many times those of the window before.
+_SUSPECT, _TIMES = 36.0, 30.0
 _BEFORE_S = 2.5  # what is known before a window may be wrong already
 _PRICE, _CLEARLY = 1.0, 30.0  # log-likelihood: of each IMU factor that is left out, and of leaving out any
 _WORSE = 6.0  # log-likelihood by which a shorter span may be less probable
