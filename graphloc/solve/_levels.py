@@ -31,7 +31,7 @@ _JUMP = 1.0  # sigmas from one node to the next: ten times the drift
 _FAR = 2.0  # sigmas: nearer, the error is at its usual level
 # Each level after each outage is another solution of the whole run.
 _OUTAGE_S, _MOST_OUTAGES, _MOST_LEVELS, _TRIAL_PASSES = 10.0, 4, 3, 6
-_COMES_BACK_OFF = 10.0  # nats: of a receiver that does after an outage
+_COMES_BACK_OFF = 6.0  # nats: of a receiver that does after an outage
 
 
 class AtLevel(NamedTuple):
