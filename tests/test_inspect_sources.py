@@ -648,17 +648,27 @@ def test_a_compass_of_a_vessel_that_goes_sideways_is_one_if_it_turns_as_the_gyro
         assert compass.mount_offset_sigma_deg == pytest.approx(10.0)
 
 
-@pytest.mark.parametrize("late_s", [0.0, 0.4, -0.4])
-def test_fixes_that_are_stamped_late_get_an_offset(late_s: float, tmp_path: Path) -> None:
-    """Drivers of serial lines stamp when they hear. The IMU tells it where the craft brakes, whatever the antenna's lever."""
-    make = Messages(2)
-    items = [item for item in drive(make, seconds=120, noise_m=0.05, status=0, sigma_m=1.0) if item[0] != "/wheel/odom"]
+def stamped_late(make: Messages, late_s: float, *, seconds: int, noise_m: float) -> list[Item]:
+    """A drive without wheels, whose fixes are stamped so much later than they were measured."""
+    items = [
+        item
+        for item in drive(make, seconds=seconds, noise_m=noise_m, status=0, sigma_m=1.0)
+        if item[0] != "/wheel/odom"
+    ]
     late_ns = round(late_s * S)
     for k, (topic, at, m) in enumerate(items):
         if topic == "/fix":
             later = make.fix(at + late_ns, m.latitude, m.longitude, m.altitude, 0, np.eye(3).ravel())
             items[k] = (topic, at + late_ns, later)
-    _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    return sorted(items, key=lambda item: item[1])
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.4, -0.4])
+def test_fixes_that_are_stamped_late_get_an_offset(late_s: float, tmp_path: Path) -> None:
+    """Drivers of serial lines stamp when they hear. The IMU tells it where the craft brakes, whatever the antenna's lever."""
+    make = Messages(2)
+    items = stamped_late(make, late_s, seconds=120, noise_m=0.05)
+    _, config, _ = look(tmp_path, items, make)
     assert config.sensors["gnss"].time_offset_s == pytest.approx(-late_s, abs=0.1)
     assert (config.sensors["gnss"].time_offset_s != 0.0) == (late_s != 0.0)
     assert isinstance(config.sensors["gnss"], GnssConfig)
@@ -669,13 +679,8 @@ def test_fixes_that_are_stamped_late_get_an_offset(late_s: float, tmp_path: Path
 def test_fixes_that_may_be_stamped_late_are_given_as_much_to_find(late_s: float, tmp_path: Path) -> None:
     """In a minute the IMU tells 0.2 s by three sigmas, no more: no offset is drafted, and a sigma of 0.05 s would not reach so far."""
     make = Messages(2)
-    items = [item for item in drive(make, seconds=60, noise_m=0.1, status=0, sigma_m=1.0) if item[0] != "/wheel/odom"]
-    late_ns = round(late_s * S)
-    for k, (topic, at, m) in enumerate(items):
-        if topic == "/fix":
-            later = make.fix(at + late_ns, m.latitude, m.longitude, m.altitude, 0, np.eye(3).ravel())
-            items[k] = (topic, at + late_ns, later)
-    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    items = stamped_late(make, late_s, seconds=60, noise_m=0.1)
+    found, config, text = look(tmp_path, items, make)
     gnss = config.sensors["gnss"]
     assert isinstance(gnss, GnssConfig)
     assert gnss.time_offset_s == 0.0

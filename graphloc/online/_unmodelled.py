@@ -101,10 +101,8 @@ class UnmodelledError:
         sigma = np.concatenate([np.zeros(0), *(slow.sigma for slow in left_out.values())])
         cov = of_errors @ np.diag(sigma**2) @ of_errors.T
         # Beside a heading that is off, the offset of a compass that agrees with it is off too.
-        turned, rows = (
-            np.vstack([np.eye(3), np.linalg.solve(P[_ROTATION, _ROTATION], P[_ROTATION, _CORE:]).T]),
-            np.r_[_ROTATION, _CORE:n],
-        )
+        turned = np.vstack([np.eye(3), np.linalg.solve(P[_ROTATION, _ROTATION], P[_ROTATION, _CORE:]).T])
+        rows = np.r_[_ROTATION, _CORE:n]
         R = newest.pose.rotation().matrix()
         by_mount = np.zeros((n, 3))
         by_mount[2] = R[2]  # at the first data the IMU has levelled itself, and sensors tell the heading of the body

@@ -108,7 +108,7 @@ def with_left_out(problem: Problem, values: gtsam.Values) -> tuple[Problem, gtsa
         if (slow := stream.left_out) is not None:
             for j in range(len(problem.timeline.slow_stamps_ns)):
                 key, zero = keys.slow(stream.number, j), np.zeros(len(slow.sigma))
-                values.update(key, zero) if values.exists(key) else values.insert(key, zero)
+                values.insert_or_assign(key, zero)
             stream = replace(stream, slow=slow, left_out=None)
         streams.append(stream)
     return replace(problem, streams=tuple(streams)), values

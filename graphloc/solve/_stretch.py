@@ -142,10 +142,8 @@ def unwound(problem: Problem, values: gtsam.Values) -> gtsam.Values:
         slow = stream.slow
         if slow is None or "yaw" not in slow.axes or not slow.constant[slow.axes.index("yaw")]:
             continue
-        yaw, names = (
-            slow.axes.index("yaw"),
-            [keys.slow(stream.number, j) for j in range(len(problem.timeline.slow_stamps_ns))],
-        )
+        yaw = slow.axes.index("yaw")
+        names = [keys.slow(stream.number, j) for j in range(len(problem.timeline.slow_stamps_ns))]
         turns = np.round(values.atVector(names[0])[yaw] / (2.0 * np.pi))
         if turns:
             found = gtsam.Values(found) if found is values else found

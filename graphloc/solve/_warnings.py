@@ -17,7 +17,7 @@ from graphloc.solution import Graded, SolveStats
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
 from graphloc.solve._decide import AGREES
 from graphloc.solve._health import CONTRADICTING_COST
-from graphloc.solve._imu_mount import MountError
+from graphloc.solve._imu_mount import MountError, mount_sigma_rad
 from graphloc.solve._imu_noise import too_quiet
 from graphloc.solve._passes import expected_cost
 from graphloc.time import stamps_of, utc_text
@@ -147,7 +147,7 @@ def mount_warning(problem: Problem, error: MountError) -> list[str]:
 
     What is left of the turn is shrunk by its prior, and scatters by what the others take off that.
     """
-    sigma = problem.config.sensors[problem.imu.sensor].mount_sigma_rad
+    sigma = mount_sigma_rad(problem)
     turn, told = float(problem.imu_turn_rad[2]) + error.yaw_rad, sigma**2 - error.sigma_rad**2
     if told < _TOLD * sigma**2 or (sigmas := abs(turn) / float(np.sqrt(told))) < _TURNED:
         return []
