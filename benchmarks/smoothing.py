@@ -70,7 +70,9 @@ def _wheels_fused() -> list[Row]:
         for recording, config in (fused, without):
             run = app.smooth_recording(recording, config, hold_out=HoldOut.parse(text))
             slow = run.solution.slow
-            held = compare_to_held_out(run.solution.trajectory, run.held, run.solution.datum, app.levers_m(run), slow)
+            held = compare_to_held_out(
+                run.solution.trajectory, run.held, run.solution.datum, app.antennas(run).of(run.solution.name), slow
+            )
             found.append(held.horizontal_rmse_m if held.fix_rmse_m is None else held.fix_rmse_m)
         gaps = text.removeprefix("gaps:").replace("x", " gaps of ") + " s"
         rows += [

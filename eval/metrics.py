@@ -8,7 +8,7 @@ a track that covers half of a run does not look better for it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,6 +199,24 @@ class FixErrors(PositionErrors):
         return PositionErrors(stamps_ns=self.stamps_ns, position_m=off_m, covered=self.covered)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Antennas:
+    """Where the antennas of the receivers are in body, by sensor.
+
+    Attributes:
+        configured: (3,) m each, by the configuration or tf.
+        off_m: (3,) m each, how far from there an estimate has them; by its name, where it estimates that.
+    """
+
+    configured: Levers
+    off_m: Mapping[str, Levers] = field(default_factory=dict)
+
+    def of(self, estimate: str) -> Levers:
+        """Return them as an estimate has them, (3,) m each."""
+        off_m = self.off_m.get(estimate, {})
+        return {name: lever_m + off_m.get(name, np.zeros(3)) for name, lever_m in self.configured.items()}
+
+
 def held_out_errors(estimate: Trajectory, held: Sequence[GnssPosition], datum: Datum, levers_m: Levers) -> FixErrors:
     """Return the errors of the predicted antenna position at held-out fixes.
 
@@ -307,11 +325,11 @@ def held_out_table(
     estimates: _Named,
     held: Sequence[GnssPosition],
     datum: Datum,
-    levers_m: Levers,
+    antennas: Antennas,
     slow: Mapping[str, Mapping[str, SlowEstimate]],
 ) -> Table:
-    """Return a table with a row per estimate, against held-out fixes; `levers_m` and `slow` of each as for `compare_to_held_out`."""
-    rows = [(name, compare_to_held_out(t, held, datum, levers_m, slow.get(name))) for name, t in estimates]
+    """Return a table with a row per estimate, against held-out fixes; `slow` of each as for `compare_to_held_out`."""
+    rows = [(name, compare_to_held_out(t, held, datum, antennas.of(name), slow.get(name))) for name, t in estimates]
     return _table("Against held-out fixes", rows, "the fixes' own noise is part of the error")
 
 

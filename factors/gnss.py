@@ -25,10 +25,22 @@ import numpy as np
 from graphloc.config import GnssConfig
 from graphloc.factors._noise import noise_model, with_floors
 from graphloc.frames import Array, Datum, Geodetic, skew
-from graphloc.graph import Attachment, Constant, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
+from graphloc.graph import (
+    PLACE,
+    TIME_OFFSET,
+    Attachment,
+    Constant,
+    Decision,
+    GraphUpdate,
+    Hint,
+    Residual,
+    Sensor,
+    SlowProcess,
+)
 from graphloc.measurements import GnssPosition, world_from_fixes
 
 _TIE_M = 0.005  # how exactly leaf and lever arm follow the pose; far below any GNSS noise
+_NOT_OFF = np.zeros(3)
 _TIE = gtsam.noiseModel.Isotropic.Sigma(3, _TIE_M)
 
 
@@ -59,19 +71,37 @@ def _fix_world_m(m: GnssPosition, at: Attachment) -> Array:
     return _world_m(m, at.datum)
 
 
-def _predicted_m(at: Attachment) -> Array:
+def _late_and_off(at: Attachment, config: GnssConfig) -> tuple[float, Array]:
+    """Return tau, s, and o (3,), m, in the antenna's axes; zero where they are not estimated."""
+    if not at.constants:  # of a sensor with none, or taken as configured to examine that
+        return 0.0, _NOT_OFF
+    value = at.constants[0][1]
+    late = float(value[0]) if config.stamp_sigma_s > 0.0 else 0.0
+    return late, value[-3:] if config.mount_sigma_m > 0.0 else _NOT_OFF
+
+
+def _predicted_m(at: Attachment, config: GnssConfig) -> Array:
     """The fix (3,) without white noise, in world."""
-    place = at.T_world_body.transformFrom(at.T_state_sensor.translation())
+    late, off = _late_and_off(at, config)
+    place = at.T_world_body.transformFrom(at.T_state_sensor.transformFrom(off))
     if at.slow_value is not None:
         place = place - at.slow_value
-    for _, late in at.constants:
-        place = place + at.sensor_velocity_mps() * late
+    if late:
+        place = place + at.sensor_velocity_mps(off) * late
     return np.asarray(place)
+
+
+def _by_constants(at: Attachment, config: GnssConfig) -> tuple[Array, ...]:
+    """Return the derivative (3, k) of the fix by tau and o, as far as they are estimated."""
+    columns = [at.sensor_velocity_mps(_late_and_off(at, config)[1])[:, None]] if config.stamp_sigma_s > 0.0 else []
+    if config.mount_sigma_m > 0.0:
+        columns.append((at.T_world_body.rotation() * at.T_state_sensor.rotation()).matrix())
+    return (np.hstack(columns),) if columns else ()
 
 
 def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Residual, ...]:
     """Residual predicted - measured (3,) in m, world axes."""
-    raw = _predicted_m(at) - _fix_world_m(m, at)
+    raw = _predicted_m(at, config) - _fix_world_m(m, at)
     white = white_covariance(m, config)
     cov = _covariance(white, at)
     return (
@@ -79,9 +109,9 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
             raw=raw,
             cov=cov,
             white=white,
-            jacobian=lambda: _antenna_jacobian(at),
+            jacobian=lambda: _antenna_jacobian(at, config),
             slow_jacobian=lambda: -np.eye(3),
-            constant_jacobians=lambda: tuple(at.sensor_velocity_mps()[:, None] for _ in at.constants),
+            constant_jacobians=lambda: _by_constants(at, config),
             prior=1.0,
             size_m=math.hypot(raw[0], raw[1]),
             size_deg=None,
@@ -129,24 +159,30 @@ def slow(config: GnssConfig) -> SlowProcess | None:
 
 
 def constants(config: GnssConfig) -> tuple[Constant, ...]:
-    """Return how much later than stamped fixes were measured, s, where that is not known."""
-    if config.stamp_sigma_s == 0.0:
+    """Return how much later than stamped fixes were measured, s, and how far off the antenna is, m, as far as that is not known."""
+    unknown: dict[str, float] = {}
+    if config.stamp_sigma_s > 0.0:
+        unknown[TIME_OFFSET] = config.stamp_sigma_s
+    if config.mount_sigma_m > 0.0:
+        unknown |= dict.fromkeys(PLACE, config.mount_sigma_m)
+    if not unknown:
         return ()
-    return (Constant(name="time offset", sigma=np.array([config.stamp_sigma_s]), corrects="time_offset_s"),)
+    # One of all: a linear factor has three states at most.
+    return (Constant(name="stamps and antenna", sigma=np.array([*unknown.values()]), corrects=tuple(unknown)),)
 
 
 def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:
     """Return the fix that the attachment's estimate would give."""
-    lat, lon, height = at.datum.geodetic_from_enu(_predicted_m(at))[0]
+    lat, lon, height = at.datum.geodetic_from_enu(_predicted_m(at, config))[0]
     return GnssPosition(
         stamp_ns=0, sensor="gnss", seq=0, position=Geodetic(lat, lon, height), cov_enu_m2=np.diag([0.25, 0.25, 1.0])
     )
 
 
-def _antenna_jacobian(at: Attachment) -> Array:
+def _antenna_jacobian(at: Attachment, config: GnssConfig) -> Array:
     """d(p + R l) / d(body tangent), (3, 6)."""
     R = at.T_world_body.rotation().matrix()
-    return np.hstack([-R @ skew(at.T_state_sensor.translation()), R])
+    return np.hstack([-R @ skew(at.T_state_sensor.transformFrom(_late_and_off(at, config)[1])), R])
 
 
 def hint(m: GnssPosition, mount_yaw_rad: float, datum: Datum) -> Hint:

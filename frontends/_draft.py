@@ -43,6 +43,7 @@ _LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images
 _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 # Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
+_ANTENNA_OFF_M = 1.0  # from the IMU: of a car; 4 m on a boat or 0.3 m on a robot are found with it as well
 _RTK_M = (0.05, 0.1)
 _RTK_SCATTER_M = 0.1
 _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off: else a wrong fix draws the track along
@@ -273,7 +274,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         lines.append(f"  enabled: false  # guess: {why}")
     else:
         lines += _filtered_lines(gnss.topic)
-    lines.append(_antenna_line(gnss.tf_frame, "from tf"))
+    lines += _antenna_lines(gnss.tf_frame, "from tf")
     lines += _scatter_lines(gnss)
     lines += _rtk_lines(gnss)
     lines += _uneven_lines(gnss)
@@ -442,13 +443,16 @@ def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None, o
         lines.append("  convention: ned  # guess: by the GNSS track")
     frame = twist.tf_frame or (gnss.tf_frame if gnss else None)
     evidence = "from tf" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
-    return [*lines, _antenna_line(frame, evidence)]
+    return [*lines, *_antenna_lines(frame, evidence)]
 
 
-def _antenna_line(frame: str | None, evidence: str) -> str:
-    if frame is None:
-        return "  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it"
-    return f"  mount: {{tf_frame: {json.dumps(frame)}}}  # {evidence}"
+def _antenna_lines(frame: str | None, evidence: str) -> list[str]:
+    if frame is not None:
+        return [f"  mount: {{tf_frame: {json.dumps(frame)}}}  # {evidence}"]
+    return [
+        "  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it",
+        f"  mount_sigma_m: {_ANTENNA_OFF_M}  # guess: how far off that may be; estimated with the run; 0 once it is measured",
+    ]
 
 
 def _filtered_lines(topic: str) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 from graphloc import app
@@ -120,7 +120,13 @@ def _effect(run: app.Run, name: str, names: list[str], solved: Solution | str, o
     if isinstance(solved, str):
         return Effect(without=name, measurements=count, fits={}, why_not=solved)
     try:
-        away = off(solved, run.solution, run.recording.truth, run.held, app.levers_m(run))
+        away = off(
+            solved,
+            run.solution,
+            run.recording.truth,
+            run.held,
+            app.antennas(replace(run, solution=solved)).of(solved.name),
+        )
     except NoCommonTimeError as error:
         return Effect(without=name, measurements=count, fits={}, why_not=str(error))
     if name or run.recording.truth is not None or run.held:

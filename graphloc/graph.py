@@ -9,7 +9,7 @@ at all. Builder and solvers know rows only through this module, never by name.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -78,14 +78,19 @@ class Attachment:
     constants: tuple[tuple[int, Array], ...] = ()
     T_solver: Any | None = None
 
-    def swing_mps(self) -> Array:
-        """Return the velocity (3,) of the sensor by the turning of the body, w x l, body axes, m/s."""
-        (wx, wy, wz), (x, y, z) = self.gyro_radps.tolist(), self.lever_m.tolist()
+    def swing_mps(self, off_m: Array | None = None) -> Array:
+        """Return the velocity (3,) of the sensor by the turning of the body, w x l, body axes, m/s.
+
+        Args:
+            off_m: (3,) how far from its mount the sensor is, in its own axes.
+        """
+        lever_m = self.lever_m if off_m is None else self.lever_m + self.T_state_sensor.rotation().matrix() @ off_m
+        (wx, wy, wz), (x, y, z) = self.gyro_radps.tolist(), lever_m.tolist()
         return np.array([wy * z - wz * y, wz * x - wx * z, wx * y - wy * x])  # `np.cross` takes ten times as long
 
-    def sensor_velocity_mps(self) -> Array:
-        """Return the velocity (3,) of the sensor at the measurement, world axes, m/s."""
-        swing = self.T_world_body.rotation().matrix() @ self.swing_mps()
+    def sensor_velocity_mps(self, off_m: Array | None = None) -> Array:
+        """Return the velocity (3,) of the sensor at the measurement, world axes, m/s; `off_m`: see `swing_mps`."""
+        swing = self.T_world_body.rotation().matrix() @ self.swing_mps(off_m)
         return np.asarray(self.v_world_mps + self.dv_world_mps + swing)
 
 
@@ -193,18 +198,34 @@ class SlowProcess:
         return kept, self.sigma**2 * (1.0 - kept**2)
 
 
+TIME_OFFSET = "time_offset_s"
+PLACE = ("mount.xyz_m[0]", "mount.xyz_m[1]", "mount.xyz_m[2]")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Constant:
     """Something that does not change in a run and that some of a sensor's measurements share; expected to be zero.
 
     Attributes:
         name: for warnings. sigma: (k,).
-        corrects: the key of vessel.yaml that it is added to, in its unit; '' for what was surveyed.
+        corrects: for each of the k, the key of vessel.yaml that it is added to, in its unit; none for what was surveyed.
     """
 
     name: str
     sigma: Array
-    corrects: str = ""
+    corrects: tuple[str, ...] = ()
+
+
+def corrections(solved: Iterable[tuple[Constant, Array]]) -> dict[str, float]:
+    """Return what the estimate of a sensor's constants adds to its settings, by their keys."""
+    return {key: float(by) for constant, value in solved for key, by in zip(constant.corrects, value, strict=False)}
+
+
+def antenna_off_m(corrected: Mapping[str, float], mount: Any) -> Array | None:
+    """Return how far from its mount (gtsam.Pose3) an antenna is (3,), m, in the axes that the mount is in; None where that is not estimated."""
+    if PLACE[0] not in corrected:
+        return None
+    return np.asarray(mount.rotation().matrix() @ np.array([corrected[key] for key in PLACE]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

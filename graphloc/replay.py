@@ -317,6 +317,7 @@ def _solution(
         slow={},
         berths=(),
         ledger=ledger,
+        antennas_off_m=smoother.antennas_off_m,
         stats=SolveStats(
             passes=0, iterations=len(estimates), states=len(kept), factors=0, cost=0.0, expected_cost=0.0, converged=True,
             warnings=tuple(warnings), events=tuple(event.text for event in events), online=True,

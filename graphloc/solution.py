@@ -143,6 +143,7 @@ class Solution:
         stats: how the solver fared.
         offsets: what the run says of levers, mounts and stamps; None where it was not asked.
         time_offsets_s: by sensor, what is to be added to its stamps beyond the configured offset, s, where the run estimates it.
+        antennas_off_m: by receiver, how far its antenna is from where it is taken to sit (3,), body axes, where the run estimates it.
     """
 
     datum: Datum
@@ -160,6 +161,7 @@ class Solution:
     stats: SolveStats
     offsets: Offsets | None = None
     time_offsets_s: Mapping[str, float] = field(default_factory=dict)
+    antennas_off_m: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def name(self) -> str:

@@ -198,7 +198,13 @@ def test_a_track_apart_from_a_drifting_receiver_predicts_its_fixes() -> None:
         numbers = metrics.compare_to_held_out(track, held, datum, levers, slow)
         assert numbers.horizontal_rmse_m == pytest.approx(off, abs=1e-6)
         assert numbers.fix_rmse_m == (None if predicted is None else pytest.approx(predicted, abs=1e-6))
-    table = metrics.held_out_table([("ours", track), ("theirs", track)], held, datum, levers, {"ours": {"gnss": drift}})
+    table = metrics.held_out_table(
+        [("ours", track), ("theirs", track)],
+        held,
+        datum,
+        metrics.Antennas(configured=levers),
+        {"ours": {"gnss": drift}},
+    )
     assert [row["fix_rmse_m"] for row in table.as_dict().values()] == [pytest.approx(1.0, abs=1e-6), None]
 
 

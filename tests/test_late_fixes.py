@@ -117,7 +117,9 @@ def test_held_out_fixes_are_read_when_they_were_measured() -> None:
     """Read at their stamps, they were 0.26 m off a track that was right to 0.02 m, and 0.04 m off the late one."""
     run = late(0.1)
     found = app.smooth_recording(run.recording, run.config, hold_out=HoldOut(gaps=4, gap_s=3.0))
-    off = compare_to_held_out(found.solution.trajectory, found.held, found.solution.datum, app.levers_m(found))
+    off = compare_to_held_out(
+        found.solution.trajectory, found.held, found.solution.datum, app.antennas(found).of(found.solution.name)
+    )
     assert off.horizontal_rmse_m < 0.1
     assert off.fixes > 25
 

@@ -14,6 +14,7 @@ from graphloc import app
 from graphloc.config import OutputConfig, VesselConfig
 from graphloc.eval import plots
 from graphloc.eval.ekf import FilterResult
+from graphloc.eval.metrics import Antennas
 from graphloc.eval.plots.paper import drawn as on_paper
 from graphloc.eval.plots.paper import write_figures
 from graphloc.eval.report import ReportData, figures
@@ -24,6 +25,8 @@ from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import GnssPosition
 from graphloc.solution import Health
 from tests.mapfactory import SQUARE, SWEDEN, drawn, framed, write
+
+NOWHERE = Antennas(configured={})
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +62,7 @@ def test_nees_and_coverage_of_an_error_made_by_hand(data: ReportData) -> None:
     assert dict(zip(held.x.round(), held.y, strict=True)) == {
         5: 0, 10: 0, 20: 0, 30: 0, 40: 0, 50: 0, 60: 0, 70: 100, 80: 100, 90: 100, 95: 100, 99: 100
     }  # fmt: skip
-    (position, *_) = marks(plots.error_over_time(data.recording, solution, (), (), {}), plots.Line)
+    (position, *_) = marks(plots.error_over_time(data.recording, solution, (), (), NOWHERE), plots.Line)
     assert isinstance(position, plots.Line)
     np.testing.assert_allclose(position.y, 0.5, rtol=1e-9)
 
@@ -78,7 +81,7 @@ def test_an_outage_and_bad_health_are_shaded_by_both(data: ReportData) -> None:
     np.testing.assert_allclose([(v - start) / 1e9 for v in outage], [8.0, 14.0], atol=0.25)
     n = len(data.solution.health)
     solution = replace(data.solution, health=(Health.GOOD,) * (n - 20) + (Health.LOST,) * 20)
-    figure = plots.error_over_time(data.recording, solution, (), (), {})
+    figure = plots.error_over_time(data.recording, solution, (), (), NOWHERE)
     spans = marks(figure, plots.Shaded)
     assert [s.name for s in spans] == ["no GNSS fix", "lost"]
     lost = spans[1]
@@ -111,7 +114,7 @@ def test_a_track_has_one_colour_in_every_figure_whoever_is_beside_it(data: Repor
         filters = [FilterResult(name=name, trajectory=track, ledger=Ledger()) for name in beside]
         found = (
             plots.run_map(data.recording, data.solution, filters),
-            plots.error_over_time(data.recording, data.solution, filters, (), {}),
+            plots.error_over_time(data.recording, data.solution, filters, (), NOWHERE),
             plots.consistency(data.recording, data.solution, filters),
             plots.coverage(data.recording, data.solution, filters),
         )

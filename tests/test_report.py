@@ -37,7 +37,7 @@ def data() -> ReportData:
         config=run.config,
         filters=run.filters,
         held=(),
-        levers_m=app.levers_m(run),
+        antennas=app.antennas(run),
         tables=app.tables(run),
         truth_statement="Truth: /truth",
     )

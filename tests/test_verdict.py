@@ -9,7 +9,7 @@ import pytest
 from graphloc import app
 from graphloc.eval.calibrate import Calibration, Check, Suggestion
 from graphloc.eval.ekf import FilterResult
-from graphloc.eval.metrics import Table
+from graphloc.eval.metrics import Antennas, Table
 from graphloc.eval.report import ReportData, Trust, durations_s, stretches, verdict
 from graphloc.eval.report._health import cure, section
 from graphloc.eval.simulate import Scenario, simulate
@@ -268,8 +268,8 @@ def test_a_receiver_that_two_sensors_contradict_is_wrong_and_the_track_is_not(
     ]
     known = {name: sensor for name, sensor in data.config.sensors.items() if name in ("imu", *others)}
     config = data.config.model_copy(update={"sensors": {**known, "gnss_2": data.config.sensors["gnss"]}})
-    levers = {"gnss": data.levers_m["gnss"], "gnss_2": data.levers_m["gnss"]}
+    antennas = Antennas(configured=dict.fromkeys(("gnss", "gnss_2"), data.antennas.configured["gnss"]))
     recording = replace(data.recording, measurements=(*data.recording.measurements, *off))
-    found = verdict(replace(data, config=config, levers_m=levers, recording=recording)).tracks[0]
+    found = verdict(replace(data, config=config, antennas=antennas, recording=recording)).tracks[0]
     assert found.trust is trust
     assert [r.trust for r in found.reasons if "fixes of gnss_2" in r.text] == [trust]

@@ -7,7 +7,7 @@ import numpy as np
 
 from graphloc.build import mount_of
 from graphloc.chi2 import SIGMAS_95
-from graphloc.config import AerialConfig, GnssConfig, VesselConfig
+from graphloc.config import AerialConfig, GnssConfig, VelocityConfig, VesselConfig
 from graphloc.eval.calibrate._evidence import LEAST, Evidence, Name, OffsetEstimate
 from graphloc.eval.calibrate._findings import Calibration, Check, Suggestion
 from graphloc.eval.calibrate._imu import imu_noise
@@ -117,6 +117,8 @@ def _suggestion(
     block = config.sensors[name[0]]
     if name[1] == "time" and isinstance(block, GnssConfig) and block.stamp_sigma_s > 0.0:
         action = "the track has it in it already, by stamp_sigma_s"
+    if name[1] in _AXIS and isinstance(block, GnssConfig | VelocityConfig) and block.mount_sigma_m > 0.0:
+        action = "the track has it in it already, by mount_sigma_m; measure it, then set it and mount_sigma_m: 0"
     if name[1] in _AXIS and (shares := _of_one_antenna(name[0], recording, config)):
         action += f", also of {', '.join(shares)}, taken for the same antenna"
     if name[1] != "time" and name[0] in recording.mounts:

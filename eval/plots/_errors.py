@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from graphloc.chi2 import chi2_below
 from graphloc.eval.ekf import FilterResult, named_tracks
-from graphloc.eval.metrics import Levers, errors, held_out_errors, squared_over_covariance
+from graphloc.eval.metrics import Antennas, errors, held_out_errors, squared_over_covariance
 from graphloc.eval.plots._marks import (
     COLOURS,
     OUTAGE,
@@ -50,7 +50,7 @@ def error_over_time(
     solution: Solution,
     filters: Sequence[FilterResult],
     held: Sequence[GnssPosition],
-    levers_m: Levers,
+    antennas: Antennas,
 ) -> Figure:
     """Return the errors of position and heading against truth, else held-out fixes; 95 % bounds; outages and health."""
     start = int(solution.trajectory.stamps_ns[0])
@@ -68,7 +68,7 @@ def error_over_time(
                 s = seconds_since(start, off.stamps_ns[at])
                 marks.append(Line(name=who, x=s, y=value[at], colour=colour, width=width))
         elif held:
-            fixes = held_out_errors(estimate, held, solution.datum, levers_m)
+            fixes = held_out_errors(estimate, held, solution.datum, antennas.of(who))
             size = fixes.horizontal_m
             at = peaks(size)
             where = seconds_since(start, fixes.stamps_ns[at])

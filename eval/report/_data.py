@@ -10,7 +10,7 @@ from graphloc.config import VesselConfig
 from graphloc.eval import plots
 from graphloc.eval.calibrate import Calibration
 from graphloc.eval.ekf import FilterResult
-from graphloc.eval.metrics import Levers, Table
+from graphloc.eval.metrics import Antennas, Table
 from graphloc.measurements import GnssPosition
 from graphloc.recording import Recording
 from graphloc.solution import Solution
@@ -22,7 +22,7 @@ class ReportData:
 
     Attributes:
         solution: of the run. online: of the online mode on the same measurements, if it was compared.
-        held: fixes that were held out. levers_m: antenna of each receiver in body, (3,) m.
+        held: fixes that were held out. antennas: of the receivers, in body.
         tables: the metrics. truth_statement: what these were measured against.
         pictures: captions and JPEGs of matches. underlay: the aerial image under the map.
         calibration: suggestions of an offline run. command: the command line.
@@ -34,7 +34,7 @@ class ReportData:
     config: VesselConfig
     filters: Sequence[FilterResult]
     held: Sequence[GnssPosition]
-    levers_m: Levers
+    antennas: Antennas
     tables: Sequence[Table]
     truth_statement: str
     pictures: Sequence[tuple[str, bytes]] = ()
@@ -72,7 +72,7 @@ def figures(data: ReportData) -> dict[str, plots.Figure]:
     recording, solution, filters = data.recording, data.solution, data.filters
     found = (
         plots.run_map(recording, solution, filters, data.held, data.underlay),
-        plots.error_over_time(recording, solution, filters, data.held, data.levers_m),
+        plots.error_over_time(recording, solution, filters, data.held, data.antennas),
         plots.consistency(recording, solution, filters),
         plots.coverage(recording, solution, filters),
         plots.berths_over_time(solution),

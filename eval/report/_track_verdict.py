@@ -145,7 +145,7 @@ def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
     far, near = {}, []
     for name, sensor in data.config.of_kind("gnss").items():
         fixes = [m for m in data.recording.of(GnssPosition, name) if m.seq not in frozen]
-        off = receiver_errors(track, fixes, solution.datum, data.levers_m)
+        off = receiver_errors(track, fixes, solution.datum, data.antennas.of(solution.name))
         if off is None:
             continue
         half_m = float(np.median(off.horizontal_m))
@@ -198,7 +198,9 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
         return
     bound_m = float(np.median(bounds_95(track.cov)[:, 0]))
     suggestions, checks = (data.calibration.suggestions, data.calibration.checks) if data.calibration else ((), ())
-    for name in data.config.of_kind("gnss"):
+    for name, block in data.config.of_kind("gnss").items():
+        if block.mount_sigma_m > 0.0:
+            continue  # it is estimated, and in the bounds
         keys = [f"sensors.{name}.mount.xyz_m[{axis}]" for axis in (0, 1)]
         off_m = math.hypot(*(s.suggested - s.configured for s in suggestions if s.key in keys))
         if off_m > 0.0:
@@ -207,7 +209,7 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
                 text=f"The antenna of {name} looks {off_m:.2f} m away from where mount.xyz_m has it, or the IMU does (Calibration, below): "
                 f"the track is off by up to as much, which its bounds of {bound_m:.2f} m (median) do not include.",
             )
-        elif name not in data.recording.mounts and not any(data.config.sensors[name].mount.xyz_m[:2]):
+        elif name not in data.recording.mounts and not any(block.mount.xyz_m[:2]):
             known = [SIGMAS_95 * c.sigma for c in checks if c.key in keys]
             known_m = math.hypot(*known) if len(known) == len(keys) else None
             said = "nothing here checks that" if known_m is None else f"this run knows it to {known_m:.2g} m (95 %)"
@@ -249,8 +251,8 @@ def _errors_of_both(data: ReportData, solution: Solution, theirs: Trajectory) ->
     held = [m for m, both in zip(data.held, ours.covers(at) & theirs.covers(at), strict=True) if both]
     if not held:
         return None
-    first = held_out_errors(ours, held, data.solution.datum, data.levers_m).predicted(solution.slow)
-    second = held_out_errors(theirs, held, data.solution.datum, data.levers_m)
+    first = held_out_errors(ours, held, data.solution.datum, data.antennas.of(solution.name)).predicted(solution.slow)
+    second = held_out_errors(theirs, held, data.solution.datum, data.antennas.configured)
     return first.horizontal_m, second.horizontal_m
 
 

@@ -16,16 +16,16 @@ from graphloc.app._estimate import (
     solve,
     with_synthetic,
 )
-from graphloc.app._run import Run, levers_m
+from graphloc.app._run import Run, antennas
 from graphloc.app._written import report_data, sha256, tables, truth_statement, write
 from graphloc.gather import Scans
 
 __all__ = [
     "Run",
     "Scans",
+    "antennas",
     "choose_datum",
     "configured",
-    "levers_m",
     "load",
     "match_at",
     "replay_recording",

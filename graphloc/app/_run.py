@@ -10,7 +10,6 @@ from graphloc.build import mount_of
 from graphloc.config import VesselConfig
 from graphloc.eval import calibrate, ekf, metrics, report
 from graphloc.eval.plots import Underlay
-from graphloc.frames import Array
 from graphloc.measurements import GnssPosition
 from graphloc.recording import Recording
 from graphloc.solution import Solution
@@ -55,13 +54,15 @@ def made_comparable(run: Run) -> Run:
         truth = None
     if speed is not None and not comparable(metrics.compare_speed, track, speed):
         speed = None
-    if held and not comparable(metrics.held_out_errors, track, held, run.solution.datum, levers_m(run)):
+    if held and not comparable(metrics.held_out_errors, track, held, run.solution.datum, antennas(run).configured):
         held = ()
 
     def fits(filtered: ekf.FilterResult) -> bool:
         return (truth is None or comparable(metrics.errors, filtered.trajectory, truth)) and (
             not held
-            or comparable(metrics.held_out_errors, filtered.trajectory, held, run.solution.datum, levers_m(run))
+            or comparable(
+                metrics.held_out_errors, filtered.trajectory, held, run.solution.datum, antennas(run).configured
+            )
         )
 
     filters = tuple(f for f in run.filters if fits(f))
@@ -72,8 +73,11 @@ def made_comparable(run: Run) -> Run:
     return replace(run, recording=recording, held=held, filters=filters, online=online)
 
 
-def levers_m(run: Run) -> dict[str, Array]:
-    """Return the antenna of each receiver in body, (3,) m."""
-    return {
-        name: mount_of(name, sensor, run.recording.mounts)[0] for name, sensor in run.config.of_kind("gnss").items()
-    }
+def antennas(run: Run) -> metrics.Antennas:
+    """Return where the antennas of the receivers are in body."""
+    receivers = run.config.of_kind("gnss")
+    solutions = [run.solution] if run.online is None else [run.solution, run.online]
+    return metrics.Antennas(
+        configured={name: mount_of(name, sensor, run.recording.mounts)[0] for name, sensor in receivers.items()},
+        off_m={solution.name: solution.antennas_off_m for solution in solutions},
+    )

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from graphloc import found_tags, outputs
-from graphloc.app._run import Run, levers_m
+from graphloc.app._run import Run, antennas
 from graphloc.eval import metrics, report
 from graphloc.eval.docking import docking_table
 from graphloc.eval.ekf import named_tracks
@@ -30,7 +30,7 @@ def tables(run: Run) -> tuple[metrics.Table, ...]:
         found += _docking_tables(run, estimates, run.recording.truth)
     if run.held:
         slow = {s.name: s.slow for s in (run.solution, run.online) if s is not None}
-        found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, levers_m(run), slow))
+        found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, antennas(run), slow))
     if run.recording.check_speed is not None:
         found.append(metrics.speed_table(estimates, run.recording.check_speed))
     whys = [f"{f.name}: {f.why}." for f in run.filters if f.why]
@@ -79,7 +79,7 @@ def report_data(run: Run, command: str = "") -> report.ReportData:
         config=run.config,
         filters=run.filters,
         held=run.held,
-        levers_m=levers_m(run),
+        antennas=antennas(run),
         tables=tables(run),
         truth_statement=truth_statement(run),
         pictures=run.pictures,

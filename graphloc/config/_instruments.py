@@ -137,6 +137,9 @@ class GnssConfig(SensorConfig):
     stamp_sigma_s: NonNegative = 0.0
     """Unknown delay of its stamps beyond `time_offset_s`, 1 sigma, s; it is estimated with the run, one of half a
     second only in part. Many drivers stamp a fix when it arrives, 0.05 to 0.5 s after it was measured; `inspect` drafts it. 0: stamps are right."""
+    mount_sigma_m: NonNegative = 0.0
+    """Unknown error of where its antenna is taken to sit (`mount.xyz_m`, or tf), 1 sigma, each axis, m; it is estimated with the run, and the
+    bounds include what is not known of it. `inspect` drafts it where nothing tells the antenna's place. 0: the place was measured."""
     grid: Annotated[str, Field(pattern=r"^(EPSG:\d{4,6})?$")] = ""
     """Map grid of `nav_msgs/Odometry`, `geometry_msgs/PoseStamped` or `PoseWithCovarianceStamped`, e.g. `EPSG:32632` for UTM zone 32 north
     (32732: south), x east and y north; z is taken for the height above the ellipsoid. Leave it empty for other messages."""
@@ -186,6 +189,8 @@ class VelocityConfig(SensorConfig):
     """Floor of the velocity sigma, m/s."""
     default_sigma_mps: Positive = 0.3
     """Sigma if the message reports no covariance, m/s."""
+    mount_sigma_m: NonNegative = 0.0
+    """Unknown error of where its antenna is taken to sit, 1 sigma, each axis, m; as that of `gnss`."""
     nmea: Velocities = ("VTG",)
     """NMEA sentences to read, from one talker (`GPVTG`) or any (`VTG`): VTG, RMC."""
 

@@ -10,6 +10,8 @@ import gtsam
 import numpy as np
 
 from graphloc.build import CONSTANT_TAILS, constant_keys
+from graphloc.frames import Array
+from graphloc.graph import Constant
 from graphloc.online._anchor import ConditionalGaussian
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Window
@@ -68,6 +70,14 @@ class Constants:
         for key in self._window.leaving([key for _, key in self._keys()], now_s):
             value = self._window.values.atVector(key)
             self._known[key] = ConditionalGaussian.independent(value, self._window.covariance([key]))
+
+    def of(self, stream: LiveStream) -> Iterator[tuple[Constant, Array]]:
+        """Yield the constants of a stream that measurements have told of, and their values (k,)."""
+        for constant, key in zip(stream.constants, constant_keys(stream), strict=True):
+            if self._window.is_committed(key):
+                yield constant, self._window.values.atVector(key)
+            elif key in self._known:
+                yield constant, self._known[key].value
 
     def seen(self) -> dict[Number, int]:
         """Return the keys of the constants in the graph."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.frames import Array
-from graphloc.graph import Residual
+from graphloc.graph import Residual, antenna_off_m, corrections
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
@@ -151,6 +151,12 @@ class Lag:
     def track(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
         """Return stamps (N,), ns, and in world positions (N, 3), attitudes (N, 3, 3) and velocities (N, 3) of the body's origin."""
         return self._states.track()
+
+    def antennas_off_m(self) -> dict[str, Array]:
+        """Return how far from its mount each antenna is (3,), m, body axes, where that is estimated."""
+        streams = self.problem.streams.values()
+        found = {s.name: antenna_off_m(corrections(self._constants.of(s)), s.mount) for s in streams}
+        return {name: off_m for name, off_m in found.items() if off_m is not None}
 
     @property
     def factor_slots(self) -> int:

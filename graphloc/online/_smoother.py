@@ -9,14 +9,14 @@ set back or where no absolute sensor agrees any more, the estimate restarts.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from graphloc.config import VesselConfig
 from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate, Event
-from graphloc.frames import Datum
+from graphloc.frames import Array, Datum
 from graphloc.frozen_imu import WHY
 from graphloc.graph import InertialRow, Sensor
 from graphloc.imu_spikes import WHY as SPIKE
@@ -87,6 +87,8 @@ class OnlineSmoother:
         self._waiting = Waiting(self._ledger)
         self._tracking: Tracking | None = None
         self._tried_ns = 0  # to start over with a measured heading
+        self.antennas_off_m: Mapping[str, Array] = {}
+        """How far from its mount each antenna is (3,), m, body axes, where that is estimated; known in the end (`finish`)."""
         self._wait(
             "the first IMU sample" if imu else f"an IMU: no enabled sensor of kind {inertial.kind} is configured"
         )
@@ -428,6 +430,7 @@ class OnlineSmoother:
         if self._tracking is not None:
             why = "the run ended before there was a state at its stamp"
             self._tracking.end(why)
+            self.antennas_off_m = self._tracking.lag.antennas_off_m()
         for m in self._intake.left():
             self._ledger.drop(m, Outcome.REJECTED, why)
         self._waiting.refuse(why)

@@ -8,8 +8,9 @@ bridges the gap (120 s: errors of 4.6 m and 30 deg beside it, where 0.1 m is usu
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,11 +140,15 @@ def _join(solutions: Sequence[Solution], rows: Sequence[LedgerRow], warnings: Se
         ledger=Ledger([*rows, *(row for s in solutions for row in s.ledger)]),
         stats=_join_stats([s.stats for s in solutions], warnings),
         offsets=joined(offsets) if (offsets := [s.offsets for s in solutions if s.offsets is not None]) else None,
-        time_offsets_s={
-            name: float(np.mean([s.time_offsets_s[name] for s in solutions if name in s.time_offsets_s]))
-            for name in dict.fromkeys(n for s in solutions for n in s.time_offsets_s)
-        },
+        time_offsets_s={name: float(by) for name, by in _mean([s.time_offsets_s for s in solutions]).items()},
+        antennas_off_m=_mean([s.antennas_off_m for s in solutions]),
     )
+
+
+def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[np.float64]]:
+    """Return the mean of what parts of a run have found, by name."""
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {name: np.mean([part[name] for part in parts if name in part], axis=0) for name in names}
 
 
 def _join_berths(parts: Sequence[BerthTrack]) -> Iterator[BerthTrack]:

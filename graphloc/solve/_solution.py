@@ -14,6 +14,7 @@ from graphloc.berths import Berth, BerthTrack, rates, seen_from
 from graphloc.build import Problem, Stream, solved_constants
 from graphloc.errors import SolveError, in_one_line
 from graphloc.frames import Array
+from graphloc.graph import TIME_OFFSET, antenna_off_m, corrections
 from graphloc.recording import Recording
 from graphloc.series import interpolated
 from graphloc.solution import SlowEstimate, Solution
@@ -75,6 +76,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     stats = replace(stats, warnings=(*stats.warnings, *unsaid), events=mount_event(result.problem))
     health, reasons = health_over_time(trajectory, since, misfits(problem, result, stats))
     ledger = ledger_of(problem, recording, result.verdicts)
+    corrected = {s.name: corrections(solved_constants(s, result.values)) for s in problem.streams}
     return Solution(
         datum=problem.datum,
         trajectory=trajectory,
@@ -89,16 +91,11 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         berths=tuple(_berth_tracks(problem, result, trajectory)),
         ledger=ledger,
         stats=stats,
-        time_offsets_s=dict(_time_offsets_s(problem, result)),
+        time_offsets_s={name: found[TIME_OFFSET] for name, found in corrected.items() if TIME_OFFSET in found},
+        antennas_off_m={
+            s.name: off_m for s in problem.streams if (off_m := antenna_off_m(corrected[s.name], s.mount)) is not None
+        },
     )
-
-
-def _time_offsets_s(problem: Problem, result: BatchResult) -> Iterator[tuple[str, float]]:
-    """Yield the sensors whose time offset is estimated, and its value, s."""
-    for stream in problem.streams:
-        for constant, value in solved_constants(stream, result.values):
-            if constant.corrects == "time_offset_s":
-                yield stream.name, float(value[0])
 
 
 def _add_doubt(result: BatchResult, cov: Array) -> list[str]:

@@ -243,14 +243,16 @@ def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     else:
         warnings += _turned_mount(stream, result)
     for constant, value in solved_constants(stream, result.values):
-        off = float(np.abs(value / constant.sigma).max())
-        if off > _FAR_OFF and constant.corrects:
+        off = np.abs(value / constant.sigma)
+        if constant.corrects:
+            warnings += [
+                f"{stream.name}: {key} is {sigmas:.1f} sigmas from where it is set: add {by:+.3f} to it"
+                for key, sigmas, by in zip(constant.corrects, off, value, strict=True)
+                if sigmas > _FAR_OFF
+            ]
+        elif off.max() > _FAR_OFF:
             warnings.append(
-                f"{stream.name}: {constant.name} is {off:.1f} sigmas from zero: add {value[0]:+.3f} to its {constant.corrects}"
-            )
-        elif off > _FAR_OFF:
-            warnings.append(
-                f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
+                f"{stream.name}: {constant.name} is {off.max():.1f} sigmas from the survey: survey it again, or raise "
                 "its sigmas"
             )
     warnings += slow_error_warning(stream.name, stream.left_out)
