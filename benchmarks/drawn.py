@@ -31,7 +31,8 @@ from graphloc.solution import Solution
 from graphloc.trajectory import Trajectory
 
 SEEDS = range(1000, 1080)  # none was looked at when a model or a number was chosen
-NOISE_SEEDS, STATED_SEEDS, ASKEW_SEEDS = range(1100, 1116), range(1120, 1136), range(1140, 1156)  # nor these
+NOISE_SEEDS, STATED_SEEDS = range(1100, 1116), range(1120, 1136)  # nor these
+ASKEW_SEEDS, DISPLACED_SEEDS = range(1140, 1156), range(1160, 1176)
 Found = dict[str, Any]
 _TOO_SURE = 6.0  # horizontal NEES: 2 where the covariance is true
 
@@ -207,16 +208,52 @@ def _mounted(seed: int) -> Found:
 def askew(pool: ProcessPoolExecutor) -> list[Row]:
     """Figures of an IMU that sits askew."""
     found = list(pool.map(_mounted, ASKEW_SEEDS))
-    label = f"{len(found)} drawn vessels, IMU's mount"
-    rows = _variants("F.mount", label, found)
+    return _with_bounds("F.mount", f"{len(found)} drawn vessels, IMU's mount", found)
+
+
+def _with_bounds(item: str, label: str, found: list[Found]) -> list[Row]:
+    rows = _variants(item, label, found)
     for way in found[0]:
         held = _column(found, way, "heading_coverage").mean() * 100
         rows += [
-            row("F.mount", f"{label} {way}: heading RMSE, mean", _column(found, way, "heading_deg").mean(), "deg"),
-            row("F.mount", f"{label} {way}: 95 % coverage of the heading, mean", held, "%"),
-            row("F.mount", f"{label} {way}: 95 % coverage, mean", _column(found, way, "coverage").mean() * 100, "%"),
+            row(item, f"{label} {way}: heading RMSE, mean", _column(found, way, "heading_deg").mean(), "deg"),
+            row(item, f"{label} {way}: 95 % coverage of the heading, mean", held, "%"),
+            row(item, f"{label} {way}: 95 % coverage, mean", _column(found, way, "coverage").mean() * 100, "%"),
         ]  # fmt: skip
     return rows
+
+
+def displaced(run: DrawnRun, *, sigma_m: float, known: bool = False) -> DrawnRun:
+    """The vessel, whose antennas sit off their mounts by 1 m, 1 sigma, along each axis.
+
+    Args:
+        sigma_m: what is said to be unknown of that. known: they sit where they are configured.
+    """
+    off_m = np.zeros(3) if known else np.random.default_rng([run.drawn["seed"], 9]).normal(0.0, 1.0, 3)
+    antennas = {}
+    for name, sensor in (run.config.of_kind("gnss") | run.config.of_kind("gnss_velocity")).items():
+        xyz_m = tuple((np.array(sensor.mount.xyz_m) - off_m).tolist())
+        mount = sensor.mount.model_copy(update={"xyz_m": xyz_m})
+        antennas[name] = sensor.model_copy(update={"mount": mount, "mount_sigma_m": sigma_m})
+    return replace(run, config=run.config.with_sensors(antennas))
+
+
+def _displaced(seed: int) -> Found:
+    drawn = drawn_run(seed)
+    return _both_ways(
+        {
+            "as configured": drawn,
+            "as configured, estimated": displaced(drawn, sigma_m=1.0, known=True),
+            "elsewhere, taken as given": displaced(drawn, sigma_m=0.0),
+            "elsewhere, estimated": displaced(drawn, sigma_m=1.0),
+        }
+    )
+
+
+def antennas(pool: ProcessPoolExecutor) -> list[Row]:
+    """Figures of antennas that sit a metre or two from where they are configured."""
+    found = list(pool.map(_displaced, DISPLACED_SEEDS))
+    return _with_bounds("F.antenna", f"{len(found)} drawn vessels, antenna", found)
 
 
 def _line(found: Found, before: Found | None) -> str:

@@ -79,6 +79,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "F.cal": calibration.figures,
     "F.drawn": drawn.figures,
     "F.mount": drawn.askew,
+    "F.antenna": drawn.antennas,
     "F.noise": drawn.noise,
     "F.stated": drawn.stated,
 }

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """GNSS position: lever arm, white noise, and a slow error.
 
-    z = p + R l + u tau + d + w,   w ~ N(0, C + W),   d: first-order Gauss-Markov per axis
+    z = p + R (l + o) + u tau + d + w,   w ~ N(0, C + W),   d: first-order Gauss-Markov per axis
 
-z: fix in world; p, R: body in world; l: antenna in body (carried, see `Attachment`); u: velocity of the antenna; tau: how
-much later than stamped the fix was measured (negative: it is stamped late), a constant of the run; C: the reported
-covariance; W: what d walks between its nodes (`Attachment.slow_walk`). The slow state holds n = -d.
+z: fix in world; p, R: body in world; l: antenna in body (carried, see `Attachment`); o: how far from there it sits, a constant of
+the run, where that is not known; u: velocity of the antenna; tau: how much later than stamped the fix was measured (negative: it is
+stamped late), a constant of the run; C: the reported covariance; W: what d walks between its nodes (`Attachment.slow_walk`). The slow
+state holds n = -d.
 
-Without a slow state and tau: `GPSFactorArm`. With them: one linear factor, written anew at every pass. A solver that goes on from
-older linearisations (online) would need it written anew whenever the pose turns; there, without tau, native factors turn along:
+Without a slow state, o and tau: `GPSFactorArm`. With them: one linear factor, written anew at every pass. A solver that goes on from
+older linearisations (online) would need it written anew whenever the pose turns; there, without o and tau, native factors turn along:
 `A = p + R l` is a leaf (`ReferenceFrameFactor`, tied within 5 mm), and `A - N = z` is a `BetweenFactor` under the kernel. These
 leaves are 45 % of the variables where each state has a fix. Not handled: correlation between axes of d; of tau what u changes by
-in that time.
+in that time, and that it tells of the velocity.
 """
 
 from __future__ import annotations
@@ -93,9 +94,11 @@ def _predicted_m(at: Attachment, config: GnssConfig) -> Array:
 
 def _by_constants(at: Attachment, config: GnssConfig) -> tuple[Array, ...]:
     """Return the derivative (3, k) of the fix by tau and o, as far as they are estimated."""
-    columns = [at.sensor_velocity_mps(_late_and_off(at, config)[1])[:, None]] if config.stamp_sigma_s > 0.0 else []
+    late, off = _late_and_off(at, config)
+    columns = [at.sensor_velocity_mps(off)[:, None]] if config.stamp_sigma_s > 0.0 else []
     if config.mount_sigma_m > 0.0:
-        columns.append((at.T_world_body.rotation() * at.T_state_sensor.rotation()).matrix())
+        turn = at.T_state_sensor.rotation().matrix()
+        columns.append(at.T_world_body.rotation().matrix() @ (turn + late * skew(at.gyro_radps) @ turn))
     return (np.hstack(columns),) if columns else ()
 
 
@@ -180,9 +183,9 @@ def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:
 
 
 def _antenna_jacobian(at: Attachment, config: GnssConfig) -> Array:
-    """d(p + R l) / d(body tangent), (3, 6)."""
-    R = at.T_world_body.rotation().matrix()
-    return np.hstack([-R @ skew(at.T_state_sensor.transformFrom(_late_and_off(at, config)[1])), R])
+    """d(p + R (l + o) + u tau) / d(body tangent), (3, 6)."""
+    R, (late, off) = at.T_world_body.rotation().matrix(), _late_and_off(at, config)
+    return np.hstack([-R @ skew(at.T_state_sensor.transformFrom(off) + late * at.swing_mps(off)), R])
 
 
 def hint(m: GnssPosition, mount_yaw_rad: float, datum: Datum) -> Hint:

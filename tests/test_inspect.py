@@ -345,6 +345,14 @@ def test_the_place_of_a_vessel_that_lies_still_is_no_mount(tmp_path: Path) -> No
     np.testing.assert_allclose(read_recording(tmp_path / "run", config).mounts["gnss"][0], [1.0, 2.0, 3.0])
 
 
+def test_an_antenna_of_which_nothing_tells_where_it_sits_is_estimated(tmp_path: Path) -> None:
+    """Taken to sit at the IMU, it was 'good' with bounds of 0.1 m, and metres off."""
+    make = Messages(2)
+    found, config, _ = look(tmp_path, drive(make, seconds=30), make)
+    assert config.of_kind("gnss")["gnss"].mount_sigma_m == 1.0
+    assert "drafted at 0, 0, 0, and estimated with the run (mount_sigma_m)" in render(found)
+
+
 @pytest.mark.parametrize("topic", ["/tf_static", "/tf"])  # on the latter repeated: static_transform_publisher of ROS 1
 def test_tf_static_beats_guessing(topic: str, tmp_path: Path) -> None:
     make = Messages(2)
@@ -356,6 +364,7 @@ def test_tf_static_beats_guessing(topic: str, tmp_path: Path) -> None:
     assert found.imus[0].mount.tf_frame == config.sensors["imu"].mount.tf_frame == "imu_link"
     recording = read_recording(tmp_path / "run", config)
     np.testing.assert_allclose(recording.mounts["gnss"][0], [1, 2, 3])
+    assert config.of_kind("gnss")["gnss"].mount_sigma_m == 0.0
     np.testing.assert_allclose(recording.mounts["imu"][1], rotation_z(90.0), atol=1e-9)
 
 

@@ -134,4 +134,4 @@ def test_calibration_names_it_all_the_same_and_that_the_track_has_it() -> None:
 
 def test_a_time_far_beyond_its_sigma_is_said() -> None:
     warnings = app.simulated(late(0.01)).solution.stats.warnings
-    assert any(w.startswith("gnss: time offset is ") and "to its time_offset_s" in w for w in warnings)
+    assert any(w.startswith("gnss: time_offset_s is ") and "sigmas from where it is set: add -" in w for w in warnings)

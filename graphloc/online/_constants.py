@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from graphloc.build import CONSTANT_TAILS, constant_keys
+from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import Constant
 from graphloc.online._anchor import ConditionalGaussian
@@ -25,13 +26,21 @@ class Constants:
 
     Args:
         known: estimates from before the window.
+
+    Raises:
+        SolveError: one of them is of another size (from a snapshot, by another configuration).
     """
 
     def __init__(self, problem: LiveProblem, window: Window, known: Mapping[Number, ConditionalGaussian]) -> None:
         self._problem, self._window = problem, window
-        self._known: dict[int, ConditionalGaussian] = {
-            key: known[number] for number, key in self._keys() if number in known
-        }
+        self._known: dict[int, ConditionalGaussian] = {}
+        for stream in problem.streams.values():
+            for n, (key, constant) in enumerate(zip(constant_keys(stream), stream.constants, strict=True)):
+                if (found := known.get((stream.name, n))) is None:
+                    continue
+                if len(found.value) != len(constant.sigma):
+                    raise SolveError(f"{stream.name}: what its measurements share is of another size")
+                self._known[key] = found
 
     def _keys(self) -> Iterator[tuple[Number, int]]:
         for stream in self._problem.streams.values():

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An antenna that sits elsewhere than configured, by a distance that is not known: it is estimated, and the bounds include it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.config import GnssConfig, VelocityConfig
+from graphloc.eval.holdout import HoldOut
+from graphloc.eval.metrics import Antennas, TruthMetrics, compare_to_held_out, compare_to_truth
+from graphloc.eval.report import verdict
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors import gnss, velocity
+from graphloc.frames import Array
+from graphloc.graph import PLACE, Attachment, Decision, Sensor, antenna_off_m, corrections
+from graphloc.linear import factors_of
+from graphloc.replay import replay
+from tests.faults import arrivals_of, feed
+from tests.slowly import with_few_states
+from tests.test_factors import attachment, values_of
+from tests.test_online_faults import smoother
+
+SCENARIO = Scenario(
+    path="loops", duration_s=40.0, noise="clean", pose_hz=0.0, gnss_hz=2.5, gnss_sigma_m=0.02, imu_hz=50.0
+)
+GNSS = GnssConfig(kind="gnss", mount_sigma_m=1.0, stamp_sigma_s=0.1)
+OFF_M = np.array([0.7, -0.4, 0.3])
+
+
+@cache
+def displaced(mount_sigma_m: float, off_m: tuple[float, float, float] = (0.9, -0.6, 1.2)) -> SimulatedRun:
+    """A run with fixes good to 2 cm, whose antenna sits `off_m` from where the configuration has it."""
+    run = simulate(SCENARIO, 3)
+    block = run.config.sensors["gnss"]
+    assert isinstance(block, GnssConfig)
+    xyz_m = tuple((np.array(block.mount.xyz_m) - off_m).tolist())
+    settings = {
+        "mount": block.mount.model_copy(update={"xyz_m": xyz_m}),
+        "mount_sigma_m": mount_sigma_m,
+        "slow_error": block.slow_error.model_copy(update={"enabled": False}),
+    }
+    config = run.config.with_sensors({"gnss": block.model_copy(update=settings)})
+    return replace(run, config=with_few_states(config, 2.5))
+
+
+@cache
+def solved(run: SimulatedRun) -> app.Run:
+    return app.simulated(run)
+
+
+def offline(run: SimulatedRun) -> TruthMetrics:
+    return compare_to_truth(solved(run).solution.trajectory, run.truth)
+
+
+def online(run: SimulatedRun) -> TruthMetrics:
+    return compare_to_truth(replay(run.recording, run.config).solution.trajectory, run.truth)
+
+
+def displacing(at: Attachment, value: Array) -> Attachment:
+    return replace(at, constants=((6, value),))
+
+
+@pytest.mark.parametrize(
+    ("row", "config", "value"),
+    [
+        pytest.param(gnss.ROW, GNSS, np.array([0.07, *OFF_M]), id="fix"),
+        pytest.param(gnss.ROW, GNSS.model_copy(update={"stamp_sigma_s": 0.0}), OFF_M, id="fix-in-time"),
+        pytest.param(velocity.ROW, VelocityConfig(kind="gnss_velocity", mount_sigma_m=1.0), OFF_M, id="velocity"),
+    ],
+)
+def test_the_jacobians_are_those_of_the_residual(row: Sensor, config: Any, value: Array) -> None:
+    """By attitude and by each constant, against differences of the residual itself."""
+    at = displacing(attachment(row, config, slow=False), value)
+    m = row.ideal(at, config)
+    (factor,) = factors_of(row, m, config, at, Decision()).factors
+    values = values_of(at, ())
+    values.insert(6, value)
+    linear, residual = factor.linearize(values), row.residuals(m, config, at)[0]
+    assert residual.raw == pytest.approx(np.zeros(3), abs=1e-6)
+    tiny = 1e-4 * np.eye(6)[:3]
+    turned = [replace(at, T_world_body=at.T_world_body.retract(step)) for step in tiny]
+    moved = [displacing(at, value + step) for step in 1e-4 * np.eye(len(value))]
+    changes = np.array([row.residuals(m, config, there)[0].raw / 1e-4 for there in (*turned, *moved)])
+    assert np.linalg.norm(changes, axis=1).min() > 0.01
+    J = np.linalg.cholesky(residual.cov) @ linear.jacobian()[0]
+    np.testing.assert_allclose(
+        J[:, [0, 1, 2, *range(J.shape[1] - len(value), J.shape[1])]].T, changes, rtol=1e-3, atol=1e-3
+    )
+
+
+def test_an_antenna_is_where_a_mount_there_has_it() -> None:
+    """Its fix and its velocity are those of an antenna that is configured there."""
+    for row, config in ((gnss.ROW, GNSS), (velocity.ROW, VelocityConfig(kind="gnss_velocity", mount_sigma_m=1.0))):
+        at = attachment(row, config, slow=False)
+        value = np.array([0.07, *OFF_M]) if row is gnss.ROW else OFF_M
+        lever_m = at.lever_m + at.T_state_sensor.rotation().matrix() @ OFF_M
+        mount = type(at.T_state_sensor)(at.T_state_sensor.rotation(), at.T_state_sensor.transformFrom(OFF_M))
+        there = replace(at, T_state_sensor=mount, lever_m=lever_m)
+        late = np.array([0.07, 0.0, 0.0, 0.0]) if row is gnss.ROW else np.zeros(3)
+        m = row.ideal(displacing(at, value), config)
+        np.testing.assert_allclose(row.residuals(m, config, displacing(there, late))[0].raw, 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", [offline, online])
+def test_a_displaced_antenna_is_found_out(mode: Callable[[SimulatedRun], TruthMetrics]) -> None:
+    believed, estimated = mode(displaced(0.0)), mode(displaced(1.0))
+    assert believed.coverage_95 is not None
+    assert estimated.nees is not None
+    assert believed.coverage_95 < 0.1
+    assert estimated.nees < 2.0  # one error for seconds until it turns: few independent samples
+    assert estimated.position_p50_m < 0.2 * believed.position_p50_m
+
+
+def test_an_antenna_that_sits_as_configured_stays_there() -> None:
+    """What a place that is not known costs where it is right: the bounds."""
+    believed, estimated = offline(displaced(0.0, (0.0, 0.0, 0.0))), offline(displaced(1.0, (0.0, 0.0, 0.0)))
+    assert estimated.position_rmse_m < believed.position_rmse_m + 0.15  # x looks like a turn of the mounts
+    assert estimated.coverage_95 is not None
+    assert estimated.coverage_95 > 0.9
+
+
+def test_it_is_told_in_axes_of_the_body() -> None:
+    """Found along the antenna's own axes, which tf may have turned."""
+    found = solved(displaced(1.0)).solution.antennas_off_m["gnss"]
+    np.testing.assert_allclose(found, [0.9, -0.6, 1.2], atol=0.2)
+    mount = attachment(gnss.ROW, GNSS).T_state_sensor
+    (constant,) = gnss.ROW.constants(GNSS)
+    told = corrections([(constant, np.array([0.07, *OFF_M]))])
+    assert told["time_offset_s"] == 0.07
+    off_m = antenna_off_m(told, mount)
+    assert off_m is not None
+    np.testing.assert_allclose(off_m, mount.transformFrom(OFF_M) - mount.translation())
+    assert antenna_off_m({}, mount) is None
+    assert set(PLACE) < set(told)
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_held_out_fixes_are_predicted_at_the_antenna_as_each_estimate_has_it(filtered: bool) -> None:
+    """A filter that believes the configured place predicts them there."""
+    run = displaced(1.0)
+    found = app.smooth_recording(run.recording, run.config, hold_out=HoldOut(gaps=4, gap_s=3.0))
+    antennas, name = app.antennas(found), "an EKF" if filtered else found.solution.name
+    off = compare_to_held_out(found.solution.trajectory, found.held, found.solution.datum, antennas.of(name))
+    assert (off.horizontal_rmse_m < 0.1) is not filtered
+    (row,) = (t for t in app.tables(found) if t.title == "Against held-out fixes")
+    said = row.as_dict()[found.solution.name]["horizontal_rmse_m"]
+    assert said == pytest.approx(off.horizontal_rmse_m) or filtered
+
+
+def test_online_knows_in_the_end_where_it_has_the_antenna() -> None:
+    run = displaced(1.0)
+    off_m = replay(run.recording, run.config).solution.antennas_off_m["gnss"]
+    np.testing.assert_allclose(off_m, [0.9, -0.6, 1.2], atol=0.3)
+
+
+def test_calibration_names_it_all_the_same_and_that_the_track_has_it() -> None:
+    found = solved(displaced(1.0)).calibration
+    assert found is not None
+    lines = {s.key: s for s in found.suggestions}
+    line, configured = lines["sensors.gnss.mount.xyz_m[0]"], displaced(1.0).config.sensors["gnss"].mount.xyz_m[0]
+    assert line.suggested - configured == pytest.approx(0.9, abs=0.3)
+    assert line.action.startswith("the track has it in it already, by mount_sigma_m")
+
+
+def test_a_place_far_beyond_its_sigma_is_said() -> None:
+    warnings = app.simulated(displaced(0.2)).solution.stats.warnings
+    assert any(w.startswith("gnss: mount.xyz_m[") and "sigmas from where it is set: add +" in w for w in warnings)
+
+
+def test_antennas_are_as_configured_for_estimates_that_find_nothing() -> None:
+    antennas = Antennas(configured={"gnss": np.ones(3)}, off_m={"graphloc": {"gnss": OFF_M}})
+    assert antennas.of("graphloc")["gnss"] == pytest.approx(1.0 + OFF_M)
+    assert antennas.of("an EKF")["gnss"] == pytest.approx(np.ones(3))
+
+
+@pytest.mark.parametrize(("mount_sigma_m", "said"), [(0.0, True), (1.0, False)])
+def test_the_report_doubts_an_origin_that_is_taken_for_the_antenna(mount_sigma_m: float, said: bool) -> None:
+    run = displaced(mount_sigma_m)
+    block = run.config.sensors["gnss"]
+    at_origin = block.model_copy(update={"mount": block.mount.model_copy(update={"xyz_m": (0.0, 0.0, 0.0)})})
+    without = replace(run.recording, truth=None)
+    data = app.report_data(replace(solved(run), recording=without, config=run.config.with_sensors({"gnss": at_origin})))
+    texts = [reason.text for track in verdict(data).tracks for reason in track.reasons]
+    assert any("antenna of gnss" in text for text in texts) is said
+
+
+def test_a_snapshot_of_other_constants_is_not_used(tmp_path: Path) -> None:
+    """Resumed with the delay of the stamps unknown, too: three numbers are no estimate of four."""
+    run, path = displaced(1.0), tmp_path / "snapshot.json"
+    came = arrivals_of(run)
+    half = len(came) // 2
+    feed(smoother(run, snapshot=path), run, came[:half])
+    gnss_late = run.config.sensors["gnss"].model_copy(update={"stamp_sigma_s": 0.1})
+    for config, used in ((run.config, True), (run.config.with_sensors({"gnss": gnss_late}), False)):
+        copy = tmp_path / f"{used}.json"
+        copy.write_bytes(path.read_bytes())
+        other = replace(run, config=config)
+        said = feed(smoother(other, snapshot=copy), other, came[half:]).events
+        assert any(e.startswith("resumed from a snapshot") for e in said) is used
+        assert any("of another size" in e and e.endswith("starts without it") for e in said) is not used
