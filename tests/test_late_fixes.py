@@ -132,6 +132,11 @@ def test_calibration_names_it_all_the_same_and_that_the_track_has_it() -> None:
     assert line.action == "the track has it in it already, by stamp_sigma_s"
 
 
-def test_a_time_far_beyond_its_sigma_is_said() -> None:
-    warnings = app.simulated(late(0.01)).solution.stats.warnings
-    assert any(w.startswith("gnss: time_offset_s is ") and "sigmas from where it is set: add -" in w for w in warnings)
+@pytest.mark.parametrize("mode", ["offline", "online"])
+def test_a_time_far_beyond_its_sigma_is_said(mode: str) -> None:
+    run = late(0.01)
+    offline = mode == "offline"
+    found = app.simulated(run).solution if offline else replay(run.recording, run.config).solution
+    said = [w for w in found.stats.warnings if "sigmas from where it is set: add -" in w]
+    assert len(said) == 1
+    assert "gnss: time_offset_s is " in said[0]

@@ -16,6 +16,7 @@ from graphloc.graph import Constant
 from graphloc.online._anchor import ConditionalGaussian
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Window
+from graphloc.solve._warnings import FAR_OFF, far_off
 
 Number = tuple[str, int]
 """Name of a sensor, and number of one of its constants."""
@@ -87,6 +88,13 @@ class Constants:
                 yield constant, self._window.values.atVector(key)
             elif key in self._known:
                 yield constant, self._known[key].value
+
+    def far_off(self, stream: LiveStream) -> Iterator[tuple[str, str]]:
+        """Yield each setting of a stream that is clearly far from where the window has it, and a line on that."""
+        for constant, key in zip(stream.constants, constant_keys(stream), strict=True):
+            if constant.corrects and self._window.is_committed(key):
+                value, sigma = self._window.values.atVector(key), np.sqrt(np.diag(self._window.covariance([key])))
+                yield from far_off(stream.name, constant, np.where(np.abs(value) > FAR_OFF * sigma, value, 0.0))
 
     def seen(self) -> dict[Number, int]:
         """Return the keys of the constants in the graph."""

@@ -228,6 +228,16 @@ class Lag:
                 stream.scatter.said, lines = True, lines + line
         return lines
 
+    def setting_warnings(self) -> list[str]:
+        """Return a warning on each delay or antenna's place that newly is clearly far from where it is set."""
+        lines = list[str]()
+        for stream in self.problem.streams.values() if self.fresh else ():
+            for key, line in self._constants.far_off(stream):
+                if key not in stream.receiver.far_off:
+                    stream.receiver.far_off.add(key)
+                    lines.append(line)
+        return lines
+
     @property
     def unmodelled_jumps(self) -> list[str]:
         """Names of the receivers that have jumped since the window was built, where the window can estimate that as their error."""

@@ -142,11 +142,13 @@ class LiveTimeline:
 
 @dataclass(slots=True, eq=False)
 class ReceiverDetectors:
-    """Detectors of what a receiver repeats, fixes or velocities, and of its position jumps; they outlive the window."""
+    """Detectors of what a receiver repeats, fixes or velocities, of its position jumps and wrong settings; they outlive the window."""
 
     repeated_fix: RepeatedFixDetector = field(default_factory=RepeatedFixDetector)
     repeated_velocity: RepeatedVelocityDetector = field(default_factory=RepeatedVelocityDetector)
     jump: JumpDetector = field(default_factory=JumpDetector)
+    far_off: set[str] = field(default_factory=set)
+    """Settings of which it was said that they are far from the estimate."""
 
     def forget(self) -> None:
         """Forget what is by the estimate, which is given up; not the levels of the fixes: a restart makes none of them right."""

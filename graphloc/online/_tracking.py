@@ -332,7 +332,7 @@ class Tracking:
             *frozen,
             *thawed,
             *fits,
-            *map(Event, [*self.lag.receiver_warnings(), *self.lag.noisier_warnings()]),
+            *map(Event, [*self.lag.receiver_warnings(), *self.lag.noisier_warnings(), *self.lag.setting_warnings()]),
         ]
 
     def _heading_news(self) -> list[Event]:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +12,7 @@ from graphloc import keys
 from graphloc.build import CONSTANT_TAILS, Problem, Stream, solved_constants
 from graphloc.config import SIGMA_SCALES, SensorConfig
 from graphloc.frames import Array
-from graphloc.graph import SlowProcess
+from graphloc.graph import Constant, SlowProcess
 from graphloc.position_jumps import jump_warnings, largest_sigma
 from graphloc.series import runs
 from graphloc.solution import Graded, SolveStats
@@ -22,7 +24,7 @@ from graphloc.solve._imu_noise import too_quiet
 from graphloc.solve._passes import expected_cost
 from graphloc.time import stamps_of, utc_text
 
-_FAR_OFF = 3.0
+FAR_OFF = 3.0
 _TURNED, _TOLD = 2.5, 0.1  # sigmas; share of a prior's variance
 _MUCH_NOISIER = 1.5
 _SMALL_M = 0.1  # a slow error below it is that of RTK
@@ -233,24 +235,26 @@ def noise_warnings(problem: Problem, result: BatchResult) -> list[str]:
     return warnings
 
 
+def far_off(name: str, constant: Constant, value: Array) -> Iterator[tuple[str, str]]:
+    """Yield each setting of a sensor that is far from where an estimate (k,) of its constant has it, and a line on that."""
+    for key, by, sigma in zip(constant.corrects, value, constant.sigma, strict=False):
+        if (off := abs(by) / sigma) > FAR_OFF:
+            yield key, f"{name}: {key} is {off:.1f} sigmas from where it is set: add {by:+.3f} to it"
+
+
 def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     warnings = list[str]()
     far, said = _far_from_prior(stream, result)
-    if far > _FAR_OFF:
+    if far > FAR_OFF:
         warnings.append(
             f"{stream.name}: {said} from zero: check its mount and the IMU's, or raise the configured sigma"
         )
     else:
         warnings += _turned_mount(stream, result)
     for constant, value in solved_constants(stream, result.values):
+        warnings += [said for _, said in far_off(stream.name, constant, value)]
         off = np.abs(value / constant.sigma)
-        if constant.corrects:
-            warnings += [
-                f"{stream.name}: {key} is {sigmas:.1f} sigmas from where it is set: add {by:+.3f} to it"
-                for key, sigmas, by in zip(constant.corrects, off, value, strict=True)
-                if sigmas > _FAR_OFF
-            ]
-        elif off.max() > _FAR_OFF:
+        if not constant.corrects and off.max() > FAR_OFF:
             warnings.append(
                 f"{stream.name}: {constant.name} is {off.max():.1f} sigmas from the survey: survey it again, or raise "
                 "its sigmas"
