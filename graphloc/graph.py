@@ -188,6 +188,11 @@ class SlowProcess:
         return ~np.isfinite(self.time_constant_s)
 
     @property
+    def mount_yaw(self) -> int | None:
+        """Number of the axis that is the yaw of the sensor's mount; None where there is none."""
+        return next((k for k, axis in enumerate(self.axes) if axis == "yaw" and self.constant[k]), None)
+
+    @property
     def far_axes(self) -> NDArray[np.bool_]:
         """Which axes (k,) may stand far off, and jump."""
         return np.array([axis in self.far for axis in self.axes])

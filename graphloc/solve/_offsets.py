@@ -120,7 +120,7 @@ def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values, Star
     streams = []
     for stream in problem.streams:
         slow = stream.slow
-        if slow is not None and any(slow.constant & (np.array(slow.axes) == "yaw")):
+        if slow is not None and slow.mount_yaw is not None:
             slow = _without_mount(problem, stream, slow, values)
         streams.append(replace(stream, slow=slow, constants=_surveyed(stream)))
     return replace(problem, streams=tuple(streams)), values, prior
@@ -135,7 +135,7 @@ def _without_mount(problem: Problem, stream: Stream, slow: SlowProcess, values: 
     """Return the slow state without the yaw of a compass, or of LiDARs, which is held as configured (in `values` too); None where nothing else is in it."""
     if len(slow.axes) == 1:
         return None
-    held = np.array(slow.axes) == "yaw"
+    held = np.arange(len(slow.axes)) == slow.mount_yaw
     for j in range(len(problem.timeline.slow_stamps_ns)):
         key = keys.slow(stream.number, j)
         values.update(key, np.where(held, 0.0, values.atVector(key)))

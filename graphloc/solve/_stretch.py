@@ -140,9 +140,8 @@ def unwound(problem: Problem, values: gtsam.Values) -> gtsam.Values:
     found = values
     for stream in problem.streams:
         slow = stream.slow
-        if slow is None or "yaw" not in slow.axes or not slow.constant[slow.axes.index("yaw")]:
+        if slow is None or (yaw := slow.mount_yaw) is None:
             continue
-        yaw = slow.axes.index("yaw")
         names = [keys.slow(stream.number, j) for j in range(len(problem.timeline.slow_stamps_ns))]
         turns = np.round(values.atVector(names[0])[yaw] / (2.0 * np.pi))
         if turns:

@@ -113,9 +113,9 @@ def _turned_mount(stream: Stream, result: BatchResult) -> list[str]:
     1 deg each is 2 deg off, 2.8 sigmas of what they should differ by. So what the others alone say is taken, its variance with it.
     """
     slow = stream.slow
-    if slow is None or "yaw" not in slow.axes or not slow.constant[slow.axes.index("yaw")]:
+    if slow is None or (k := slow.mount_yaw) is None:
         return []
-    k, key = slow.axes.index("yaw"), keys.slow(stream.number, 0)
+    key = keys.slow(stream.number, 0)
     value, sigma = float(result.values.atVector(key)[k]), float(slow.sigma[k])
     try:
         var = float(result.tree.marginalCovariance(key)[k, k])
