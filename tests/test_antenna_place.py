@@ -34,9 +34,11 @@ OFF_M = np.array([0.7, -0.4, 0.3])
 
 
 @cache
-def displaced(mount_sigma_m: float, off_m: tuple[float, float, float] = (0.9, -0.6, 1.2)) -> SimulatedRun:
+def displaced(
+    mount_sigma_m: float, off_m: tuple[float, float, float] = (0.9, -0.6, 1.2), scenario: Scenario = SCENARIO
+) -> SimulatedRun:
     """A run with fixes good to 2 cm, whose antenna sits `off_m` from where the configuration has it."""
-    run = simulate(SCENARIO, 3)
+    run = simulate(scenario, 3)
     block = run.config.sensors["gnss"]
     assert isinstance(block, GnssConfig)
     xyz_m = tuple((np.array(block.mount.xyz_m) - off_m).tolist())
@@ -188,6 +190,18 @@ def test_the_report_doubts_an_origin_that_is_taken_for_the_antenna(mount_sigma_m
     data = app.report_data(replace(solved(run), recording=without, config=run.config.with_sensors({"gnss": at_origin})))
     texts = [reason.text for track in verdict(data).tracks for reason in track.reasons]
     assert any("antenna of gnss" in text for text in texts) is said
+
+
+def test_a_vessel_that_lies_still_is_no_surer_of_its_place_after_restarts(tmp_path: Path) -> None:
+    """Where nothing new is told, position and antenna are known together only; apart, each restart would tell them again."""
+    lying = replace(SCENARIO, path="still", duration_s=30.0, wave_roll_deg=0.2, wave_pitch_deg=0.2, wave_heave_m=0.02)
+    run = displaced(1.0, scenario=lying)
+    came, path = arrivals_of(run), tmp_path / "snapshot.json"
+    whole = feed(smoother(run), run, came).estimates[-1]
+    for part in np.array_split(np.arange(len(came)), 5):
+        fed = feed(smoother(run, snapshot=path), run, came[part[0] : part[-1] + 1])
+    assert any(event.startswith("resumed from a snapshot") for event in fed.events)
+    assert fed.estimates[-1].bound_95_m > 0.8 * whole.bound_95_m
 
 
 def test_a_snapshot_of_other_constants_is_not_used(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import gtsam
@@ -13,7 +13,7 @@ from graphloc.build import CONSTANT_TAILS, constant_keys
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import Constant
-from graphloc.online._anchor import ConditionalGaussian
+from graphloc.online._anchor import Anchor, ConditionalGaussian
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Window
 
@@ -41,6 +41,14 @@ class Constants:
                 if len(found.value) != len(constant.sigma):
                     raise SolveError(f"{stream.name}: what its measurements share is of another size")
                 self._known[key] = found
+
+    def begin(self, anchor: Anchor, state: Sequence[int]) -> None:
+        """Stage those that are known only together with the anchor's state, by the keys of its pose, velocity and bias."""
+        for key, known in [*self._known.items()]:
+            if known.gain.any():
+                del self._known[key]
+                self._window.guess(key, known.value, 0.0)
+                self._window.add([anchor.conditional_factor(known, state, key)])
 
     def _keys(self) -> Iterator[tuple[Number, int]]:
         for stream in self._problem.streams.values():
