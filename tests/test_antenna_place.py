@@ -15,6 +15,7 @@ from graphloc.config import GnssConfig, VelocityConfig
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import Antennas, TruthMetrics, compare_to_held_out, compare_to_truth
 from graphloc.eval.report import verdict
+from graphloc.eval.report._theses import _gnss_error_m
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import gnss, velocity
 from graphloc.frames import Array
@@ -133,12 +134,12 @@ def test_it_is_told_in_axes_of_the_body() -> None:
     np.testing.assert_allclose(found, [0.9, -0.6, 1.2], atol=0.2)
     mount = attachment(gnss.ROW, GNSS).T_state_sensor
     (constant,) = gnss.ROW.constants(GNSS)
-    told = corrections([(constant, np.array([0.07, *OFF_M]))])
+    told = corrections([(constant, np.array([0.07, *OFF_M]))], mount)
     assert told["time_offset_s"] == 0.07
-    off_m = antenna_off_m(told, mount)
+    off_m = antenna_off_m(told)
     assert off_m is not None
     np.testing.assert_allclose(off_m, mount.transformFrom(OFF_M) - mount.translation())
-    assert antenna_off_m({}, mount) is None
+    assert antenna_off_m({}) is None
     assert set(PLACE) < set(told)
 
 
@@ -173,6 +174,26 @@ def test_calibration_names_it_all_the_same_and_that_the_track_has_it() -> None:
 def test_a_place_far_beyond_its_sigma_is_said() -> None:
     warnings = app.simulated(displaced(0.2)).solution.stats.warnings
     assert any(w.startswith("gnss: mount.xyz_m[") and "sigmas from where it is set: add +" in w for w in warnings)
+
+
+def test_what_is_to_be_added_is_in_axes_of_the_body() -> None:
+    """With an antenna whose own axes are turned, its x was said to be off where its y is."""
+    run = displaced(0.2)
+    block = run.config.sensors["gnss"]
+    turned = block.model_copy(update={"mount": block.mount.model_copy(update={"rpy_deg": (0.0, 0.0, 90.0)})})
+    warnings = app.simulated(replace(run, config=run.config.with_sensors({"gnss": turned}))).solution.stats.warnings
+    by_m = {
+        w.split("[")[1][0]: float(w.split("add ")[1].split()[0]) for w in warnings if w.startswith("gnss: mount.xyz_m[")
+    }
+    assert by_m["0"] == pytest.approx(0.9, abs=0.3)
+    assert by_m["2"] == pytest.approx(1.2, abs=0.3)
+
+
+def test_the_error_of_a_receiver_is_told_at_its_antenna() -> None:
+    """Against truth, at the configured place, its fixes were as far off as the antenna."""
+    run = displaced(1.0)
+    ((_, rmse_m, _),) = _gnss_error_m(app.report_data(solved(run)), run.truth)
+    assert rmse_m < 0.3
 
 
 def test_antennas_are_as_configured_for_estimates_that_find_nothing() -> None:

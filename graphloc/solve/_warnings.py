@@ -10,7 +10,7 @@ from graphloc import keys
 from graphloc.build import CONSTANT_TAILS, Problem, Stream, solved_constants
 from graphloc.config import SIGMA_SCALES, SensorConfig
 from graphloc.frames import Array
-from graphloc.graph import SlowProcess
+from graphloc.graph import SlowProcess, corrections
 from graphloc.position_jumps import jump_warnings, largest_sigma
 from graphloc.series import runs
 from graphloc.solution import Graded, SolveStats
@@ -243,16 +243,15 @@ def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     else:
         warnings += _turned_mount(stream, result)
     for constant, value in solved_constants(stream, result.values):
-        off = np.abs(value / constant.sigma)
-        if constant.corrects:
-            warnings += [
-                f"{stream.name}: {key} is {sigmas:.1f} sigmas from where it is set: add {by:+.3f} to it"
-                for key, sigmas, by in zip(constant.corrects, off, value, strict=True)
-                if sigmas > _FAR_OFF
-            ]
-        elif off.max() > _FAR_OFF:
+        found = corrections([(constant, value)], stream.mount)
+        warnings += [
+            f"{stream.name}: {key} is {abs(by) / sigma:.1f} sigmas from where it is set: add {by:+.3f} to it"
+            for (key, by), sigma in zip(found.items(), constant.sigma, strict=False)
+            if abs(by) > _FAR_OFF * sigma
+        ]
+        if not found and (off := np.abs(value / constant.sigma).max()) > _FAR_OFF:
             warnings.append(
-                f"{stream.name}: {constant.name} is {off.max():.1f} sigmas from the survey: survey it again, or raise "
+                f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
                 "its sigmas"
             )
     warnings += slow_error_warning(stream.name, stream.left_out)
