@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from graphloc.build import mount_of
 from graphloc.chi2 import chi2_95
 from graphloc.config import VesselConfig
-from graphloc.eval.metrics import receiver_errors
+from graphloc.eval.metrics import Levers, receiver_errors
 from graphloc.frames import Array, Datum, heading_deg_from_yaw
 from graphloc.measurements import GnssPosition
 from graphloc.recording import Recording
@@ -32,13 +32,16 @@ _BLOCK_S, _FEWEST = 10.0, 3  # fewer blocks do not tell what hardly moves
 _PLACES = ("pose", "aerial", "apriltag", "gnss")
 
 
-def gnss_offset_warnings(track: Trajectory, datum: Datum, recording: Recording, config: VesselConfig) -> list[str]:
+def gnss_offset_warnings(
+    track: Trajectory, datum: Datum, recording: Recording, config: VesselConfig, antennas_off_m: Levers
+) -> list[str]:
     """Return a line for each receiver with a constant offset from a solved track that its slow error does not explain.
 
     Args:
         track: of the body. datum: origin of world.
         recording: the measurements; only receivers beside another position sensor are checked.
         config: sensors, their slow errors and mounts.
+        antennas_off_m: (3,) m each, by receiver, how far from its mount the track has its antenna, where it estimates that.
     """
     lines = []
     measured = {m.sensor for m in recording.measurements if m.seq >= 0}
@@ -47,7 +50,8 @@ def gnss_offset_warnings(track: Trajectory, datum: Datum, recording: Recording, 
         fixes = recording.of(GnssPosition, name)
         if sensor.slow_error.enabled is False or not others:
             continue
-        found = receiver_errors(track, fixes, datum, {name: mount_of(name, sensor, recording.mounts)[0]})
+        lever_m = mount_of(name, sensor, recording.mounts)[0] + antennas_off_m.get(name, np.zeros(3))
+        found = receiver_errors(track, fixes, datum, {name: lever_m})
         if found is None:
             continue
         stamps, off = found.stamps_ns, _means(found.stamps_ns, -found.position_m)

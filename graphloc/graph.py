@@ -221,16 +221,18 @@ class Constant:
     corrects: tuple[str, ...] = ()
 
 
-def corrections(solved: Iterable[tuple[Constant, Array]]) -> dict[str, float]:
-    """Return what the estimate of a sensor's constants adds to its settings, by their keys."""
-    return {key: float(by) for constant, value in solved for key, by in zip(constant.corrects, value, strict=False)}
+def corrections(solved: Iterable[tuple[Constant, Array]], mount: Any) -> dict[str, float]:
+    """Return what the estimate of a sensor's constants adds to its settings, by their keys; a place is turned into the axes of its mount (gtsam.Pose3)."""
+    found = {key: float(by) for constant, value in solved for key, by in zip(constant.corrects, value, strict=False)}
+    if PLACE[0] in found:
+        off_m = mount.rotation().matrix() @ np.array([found[key] for key in PLACE])
+        found |= zip(PLACE, off_m.tolist(), strict=True)
+    return found
 
 
-def antenna_off_m(corrected: Mapping[str, float], mount: Any) -> Array | None:
-    """Return how far from its mount (gtsam.Pose3) an antenna is (3,), m, in the axes that the mount is in; None where that is not estimated."""
-    if PLACE[0] not in corrected:
-        return None
-    return np.asarray(mount.rotation().matrix() @ np.array([corrected[key] for key in PLACE]))
+def antenna_off_m(corrected: Mapping[str, float]) -> Array | None:
+    """Return how far from where it is taken to sit an antenna is (3,), m, body axes; None where that is not estimated."""
+    return np.array([corrected[key] for key in PLACE]) if PLACE[0] in corrected else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,6 +15,7 @@ from graphloc.config import GnssConfig, VelocityConfig
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import Antennas, TruthMetrics, compare_to_held_out, compare_to_truth
 from graphloc.eval.report import verdict
+from graphloc.eval.report._theses import _gnss_error_m
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import gnss, velocity
 from graphloc.frames import Array
@@ -34,9 +35,11 @@ OFF_M = np.array([0.7, -0.4, 0.3])
 
 
 @cache
-def displaced(mount_sigma_m: float, off_m: tuple[float, float, float] = (0.9, -0.6, 1.2)) -> SimulatedRun:
+def displaced(
+    mount_sigma_m: float, off_m: tuple[float, float, float] = (0.9, -0.6, 1.2), scenario: Scenario = SCENARIO
+) -> SimulatedRun:
     """A run with fixes good to 2 cm, whose antenna sits `off_m` from where the configuration has it."""
-    run = simulate(SCENARIO, 3)
+    run = simulate(scenario, 3)
     block = run.config.sensors["gnss"]
     assert isinstance(block, GnssConfig)
     xyz_m = tuple((np.array(block.mount.xyz_m) - off_m).tolist())
@@ -131,12 +134,12 @@ def test_it_is_told_in_axes_of_the_body() -> None:
     np.testing.assert_allclose(found, [0.9, -0.6, 1.2], atol=0.2)
     mount = attachment(gnss.ROW, GNSS).T_state_sensor
     (constant,) = gnss.ROW.constants(GNSS)
-    told = corrections([(constant, np.array([0.07, *OFF_M]))])
+    told = corrections([(constant, np.array([0.07, *OFF_M]))], mount)
     assert told["time_offset_s"] == 0.07
-    off_m = antenna_off_m(told, mount)
+    off_m = antenna_off_m(told)
     assert off_m is not None
     np.testing.assert_allclose(off_m, mount.transformFrom(OFF_M) - mount.translation())
-    assert antenna_off_m({}, mount) is None
+    assert antenna_off_m({}) is None
     assert set(PLACE) < set(told)
 
 
@@ -173,6 +176,26 @@ def test_a_place_far_beyond_its_sigma_is_said() -> None:
     assert any(w.startswith("gnss: mount.xyz_m[") and "sigmas from where it is set: add +" in w for w in warnings)
 
 
+def test_what_is_to_be_added_is_in_axes_of_the_body() -> None:
+    """With an antenna whose own axes are turned, its x was said to be off where its y is."""
+    run = displaced(0.2)
+    block = run.config.sensors["gnss"]
+    turned = block.model_copy(update={"mount": block.mount.model_copy(update={"rpy_deg": (0.0, 0.0, 90.0)})})
+    warnings = app.simulated(replace(run, config=run.config.with_sensors({"gnss": turned}))).solution.stats.warnings
+    by_m = {
+        w.split("[")[1][0]: float(w.split("add ")[1].split()[0]) for w in warnings if w.startswith("gnss: mount.xyz_m[")
+    }
+    assert by_m["0"] == pytest.approx(0.9, abs=0.3)
+    assert by_m["2"] == pytest.approx(1.2, abs=0.3)
+
+
+def test_the_error_of_a_receiver_is_told_at_its_antenna() -> None:
+    """Against truth, at the configured place, its fixes were as far off as the antenna."""
+    run = displaced(1.0)
+    ((_, rmse_m, _),) = _gnss_error_m(app.report_data(solved(run)), run.truth)
+    assert rmse_m < 0.3
+
+
 def test_antennas_are_as_configured_for_estimates_that_find_nothing() -> None:
     antennas = Antennas(configured={"gnss": np.ones(3)}, off_m={"graphloc": {"gnss": OFF_M}})
     assert antennas.of("graphloc")["gnss"] == pytest.approx(1.0 + OFF_M)
@@ -188,6 +211,30 @@ def test_the_report_doubts_an_origin_that_is_taken_for_the_antenna(mount_sigma_m
     data = app.report_data(replace(solved(run), recording=without, config=run.config.with_sensors({"gnss": at_origin})))
     texts = [reason.text for track in verdict(data).tracks for reason in track.reasons]
     assert any("antenna of gnss" in text for text in texts) is said
+
+
+def test_a_vessel_that_lies_still_is_no_surer_of_its_place_after_restarts(tmp_path: Path) -> None:
+    """Where nothing new is told, position and antenna are known together only; apart, each restart would tell them again."""
+    lying = replace(SCENARIO, path="still", duration_s=30.0, wave_roll_deg=0.2, wave_pitch_deg=0.2, wave_heave_m=0.02)
+    run = displaced(1.0, scenario=lying)
+    came, path = arrivals_of(run), tmp_path / "snapshot.json"
+    whole = feed(smoother(run), run, came).estimates[-1]
+    for part in np.array_split(np.arange(len(came)), 5):
+        fed = feed(smoother(run, snapshot=path), run, came[part[0] : part[-1] + 1])
+    assert any(event.startswith("resumed from a snapshot") for event in fed.events)
+    assert fed.estimates[-1].bound_95_m > 0.8 * whole.bound_95_m
+
+
+def test_a_mount_that_was_set_as_told_is_not_corrected_twice(tmp_path: Path) -> None:
+    """What a snapshot knows of the antenna's place is of the mount before: resumed with it, the track was 1 m off, 'good', bound 0.3 m."""
+    run, path = displaced(1.0), tmp_path / "snapshot.json"
+    measured = replace(run, config=displaced(1.0, (0.0, 0.0, 0.0)).config)
+    came = arrivals_of(run)
+    half = len(came) // 2
+    feed(smoother(run, snapshot=path), run, came[:half])
+    resumed = feed(smoother(measured, snapshot=path), measured, came[half:])
+    assert any(e.startswith("resumed from a snapshot") for e in resumed.events)
+    assert resumed.errors_m[-1] < 0.3
 
 
 def test_a_snapshot_of_other_constants_is_not_used(tmp_path: Path) -> None:

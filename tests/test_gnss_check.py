@@ -28,7 +28,9 @@ def run() -> SimulatedRun:
     return sparsely(simulate_slowly(scenario, 21, rate_hz=2.5), 2)
 
 
-def said(run: SimulatedRun, east_north_m: Array, every_s: int = 1, up_m: float = 0.0) -> list[str]:
+def said(
+    run: SimulatedRun, east_north_m: Array, every_s: int = 1, up_m: float = 0.0, **antennas_off_m: Array
+) -> list[str]:
     """What is said of a GNSS error (N, 2) at each fix beside a craft that lies still, with 0.3 m of white noise on it."""
     off = east_north_m + 0.3 * np.random.default_rng(1).normal(size=east_north_m.shape)
     n = len(off)
@@ -44,7 +46,8 @@ def said(run: SimulatedRun, east_north_m: Array, every_s: int = 1, up_m: float =
         for k, t in enumerate(stamps)
     )
     pose = run.recording.of(PoseFix)[0]
-    return gnss_offset_warnings(track, DATUM, replace(run.recording, measurements=(pose, *fixes)), run.config)
+    recording = replace(run.recording, measurements=(pose, *fixes))
+    return gnss_offset_warnings(track, DATUM, recording, run.config, antennas_off_m)
 
 
 def process(rng: np.random.Generator, lasts_s: int, every_s: int) -> Array:
@@ -85,6 +88,13 @@ def test_a_height_above_the_geoid_beside_one_above_the_ellipsoid_is_reported(run
     assert "gnss has a constant offset of 36.0 m (down) from height" in line  # matches tell none
     assert "geoid" in line
     assert said(run, np.zeros((60, 2)), up_m=12.0) == []  # its slow error in height is 5 m, 1 sigma
+
+
+def test_an_antenna_that_is_found_elsewhere_is_no_offset(run: SimulatedRun) -> None:
+    """A mast of 36 m was said to be the geoid, and one ahead, on a straight course, a wrong map."""
+    off_m = np.array([8.0, 0.0, 36.0])
+    assert len(said(run, np.tile(off_m[:2], (60, 1)), up_m=36.0)) == 2
+    assert said(run, np.tile(off_m[:2], (60, 1)), up_m=36.0, gnss=off_m) == []
 
 
 def test_poses_all_off_by_five_metres_are_reported(run: SimulatedRun) -> None:

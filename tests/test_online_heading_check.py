@@ -16,7 +16,7 @@ from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
 from graphloc.factors import gnss, imu
 from graphloc.frames import Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.measurements import CompassHeading, GnssPosition
-from graphloc.online._heading_check import HeadingCheck
+from graphloc.online._heading_check import HeadingCheck, _lever_m
 from graphloc.recording import Recording
 from graphloc.replay import Replayed, replay
 from graphloc.solution import Health
@@ -142,7 +142,7 @@ def said_of(run: SimulatedRun, jump_s: tuple[float, float], turned_rad: float, b
         newest = SimpleNamespace(
             stamp_ns=stamp_ns, pose=pose, pose_cov=1e-4 * np.eye(6), bias=gtsam.imuBias.ConstantBias()
         )
-        lag: Any = SimpleNamespace(first_ns=begin_ns, problem=problem, newest=newest)
+        lag: Any = SimpleNamespace(first_ns=begin_ns, problem=problem, newest=newest, antennas_off_m=dict)
         while waiting and waiting[0].stamp_ns <= stamp_ns:
             m = waiting.popleft()
             if jump_s[0] <= (m.stamp_ns - begin_ns) / SECOND < jump_s[1]:
@@ -165,3 +165,11 @@ def test_fixes_that_jump_neither_hide_a_wrong_heading_nor_make_one(
 def test_a_wrong_heading_is_found_after_the_clock_was_set_back(at_two_hertz: SimulatedRun) -> None:
     an_hour_ahead_ns = int(at_two_hertz.truth.stamps_ns[0]) + 3600 * SECOND
     assert len(said_of(at_two_hertz, (0.0, 0.0), np.radians(70.0), an_hour_ahead_ns)) == 1
+
+
+def test_an_antenna_swings_about_the_imu_by_its_distance_from_there() -> None:
+    """3 m by its mount, which is from the IMU, and 1 m more as the run has found; not less by where the IMU is."""
+    stream = SimpleNamespace(mount=gtsam.Pose3(gtsam.Rot3(), np.array([3.0, 0.0, 0.0])))
+    problem = SimpleNamespace(streams={"gnss": stream}, t_body_imu_m=np.array([5.0, 0.0, 0.0]))
+    lag: Any = SimpleNamespace(problem=problem, antennas_off_m=lambda: {"gnss": np.array([1.0, 0.0, 0.0])})
+    np.testing.assert_allclose(_lever_m(lag, "gnss"), [4.0, 0.0, 0.0])

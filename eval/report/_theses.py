@@ -70,9 +70,8 @@ def _gnss_error_m(data: ReportData, truth: Trajectory) -> list[tuple[str, float,
     """Return RMSE and largest horizontal error (m) of each receiver, at its antenna."""
     found = []
     for name in data.config.of_kind("gnss"):
-        off = receiver_errors(
-            truth, data.recording.of(GnssPosition, name), data.solution.datum, data.antennas.configured
-        )
+        antennas = data.antennas.of(data.solution.name)
+        off = receiver_errors(truth, data.recording.of(GnssPosition, name), data.solution.datum, antennas)
         if off is not None:
             found.append((name, rms(off.horizontal_m), float(off.horizontal_m.max())))
     return found

@@ -175,7 +175,8 @@ def _track_warnings(
 ) -> tuple[list[MountDoubt], list[str]]:
     """What a solved track, offline or online, tells of the configuration: of how the craft lies and goes, and of its sensors."""
     track = solution.trajectory
-    return mount_doubts(track, recording, config), gnss_offset_warnings(track, solution.datum, recording, config)
+    offsets = gnss_offset_warnings(track, solution.datum, recording, config, solution.antennas_off_m)
+    return mount_doubts(track, recording, config), offsets
 
 
 def _online(

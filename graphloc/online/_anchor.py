@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimate at one state, to continue from: after the start, after a failure of the solver, after a kill.
 
-Kept are the joint Gaussian of pose, velocity and bias, and that of each slow state conditional on these: the slow error of a
-receiver is correlated with the position.
+Kept are the joint Gaussian of pose, velocity and bias, and that of each slow state, and of each constant in the window, conditional
+on these: the slow error of a receiver is correlated with the position, and so is the place of its antenna. Independent of the position,
+that place would be told by the next fix again, from the same prior: a vessel that lay still was so sure of its position to 0.24
+instead of 0.54 m after five restarts, and 1.1 m off.
 """
 
 from __future__ import annotations
@@ -104,15 +106,7 @@ class Anchor:
         own = [np.arange(a, b) for a, b in pairwise(ends)]
         pose, velocity, bias = point
         core = range(_CORE)
-        beside = {
-            name: _conditional(mean[[*core, *rows]], cov[np.ix_([*core, *rows], [*core, *rows])])
-            for name, rows in zip(slow, own, strict=False)
-        }
-        # Not conditional on the state: when a constant is seen again, its prior cannot depend on an old state.
-        alone = {
-            number: ConditionalGaussian.independent(mean[rows], cov[np.ix_(rows, rows)])
-            for number, rows in zip(constants, own[len(slow) :], strict=True)
-        }
+        beside = [_conditional(mean[[*core, *rows]], cov[np.ix_([*core, *rows], [*core, *rows])]) for rows in own]
         return cls(
             stamp_ns=stamp_ns,
             pose=pose,
@@ -120,8 +114,8 @@ class Anchor:
             bias=bias,
             step=mean[:_CORE],
             cov=cov[:_CORE, :_CORE],
-            slow=beside,
-            constants=alone,
+            slow=dict(zip(slow, beside, strict=False)),
+            constants=dict(zip(constants, beside[len(slow) :], strict=True)),
         )
 
     @classmethod

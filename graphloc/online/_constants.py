@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import gtsam
@@ -12,8 +12,8 @@ import numpy as np
 from graphloc.build import CONSTANT_TAILS, constant_keys
 from graphloc.errors import SolveError
 from graphloc.frames import Array
-from graphloc.graph import Constant
-from graphloc.online._anchor import ConditionalGaussian
+from graphloc.graph import PLACE, Constant
+from graphloc.online._anchor import Anchor, ConditionalGaussian
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Window
 from graphloc.solve._warnings import FAR_OFF, far_off
@@ -42,6 +42,14 @@ class Constants:
                 if len(found.value) != len(constant.sigma):
                     raise SolveError(f"{stream.name}: what its measurements share is of another size")
                 self._known[key] = found
+
+    def begin(self, anchor: Anchor, state: Sequence[int]) -> None:
+        """Stage those that are known only together with the anchor's state, by the keys of its pose, velocity and bias."""
+        for key, known in [*self._known.items()]:
+            if known.gain.any():
+                del self._known[key]
+                self._window.guess(key, known.value, 0.0)
+                self._window.add([anchor.conditional_factor(known, state, key)])
 
     def _keys(self) -> Iterator[tuple[Number, int]]:
         for stream in self._problem.streams.values():
@@ -94,7 +102,11 @@ class Constants:
         for constant, key in zip(stream.constants, constant_keys(stream), strict=True):
             if constant.corrects and self._window.is_committed(key):
                 value, sigma = self._window.values.atVector(key), np.sqrt(np.diag(self._window.covariance([key])))
-                yield from far_off(stream.name, constant, np.where(np.abs(value) > FAR_OFF * sigma, value, 0.0))
+                for setting, by, said in far_off(stream.name, constant, value, stream.mount):
+                    # Of a place the largest: a mount may turn its axes.
+                    unsure = sigma[-3:].max() if setting in PLACE else sigma[constant.corrects.index(setting)]
+                    if abs(by) > FAR_OFF * unsure:
+                        yield setting, said
 
     def seen(self) -> dict[Number, int]:
         """Return the keys of the constants in the graph."""

@@ -207,9 +207,7 @@ class HeadingCheck:
 
     def _felt(self, lag: Lag, newest: Newest, drift_radps: Array) -> tuple[Array, Array]:
         """Return times (N,), s, relative to the newest state, and s, x2 and x3 (3, N), complex, in world."""
-        stream = lag.problem.streams[self._sensor]
-        lever = np.asarray(stream.mount.translation()) - lag.problem.t_body_imu_m
-        R, v, p, places, ahead = np.eye(3), np.zeros(3), np.zeros(3), [], []
+        lever, R, v, p, places, ahead = _lever_m(lag, self._sensor), np.eye(3), np.zeros(3), np.zeros(3), [], []
         for step in self._steps:
             dt_s = (step.until_ns - step.from_ns) * 1e-9
             p, v = p + v * dt_s + R @ step.dp, v + R @ step.dv
@@ -222,6 +220,12 @@ class HeadingCheck:
         twice = np.cumsum(np.cumsum(x) * dt)
         at_s = (np.array([step.until_ns for step in self._steps]) - newest.stamp_ns) * 1e-9
         return at_s, np.array([place, twice, np.cumsum(twice * dt)])
+
+
+def _lever_m(lag: Lag, receiver: str) -> Array:
+    """Return where an antenna is from the IMU (3,), m, body axes, as the window has it."""
+    mount = lag.problem.streams[receiver].mount  # from the IMU, too
+    return np.asarray(mount.translation()) + lag.antennas_off_m().get(receiver, np.zeros(3))
 
 
 def _off(fit: Fit | None) -> tuple[float, float] | None:

@@ -155,7 +155,7 @@ class Lag:
     def antennas_off_m(self) -> dict[str, Array]:
         """Return how far from its mount each antenna is (3,), m, body axes, where that is estimated."""
         streams = self.problem.streams.values()
-        found = {s.name: antenna_off_m(corrections(self._constants.of(s)), s.mount) for s in streams}
+        found = {s.name: antenna_off_m(corrections(self._constants.of(s), s.mount)) for s in streams}
         return {name: off_m for name, off_m in found.items() if off_m is not None}
 
     @property

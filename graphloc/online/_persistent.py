@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from graphloc.config import SIGMA_SCALES
+from graphloc.config import SIGMA_SCALES, VesselConfig
 from graphloc.frames import Datum
 from graphloc.measurements import ImuSample
 from graphloc.motion_model import MotionModel
@@ -17,7 +17,7 @@ from graphloc.online._live import ReceiverDetectors
 from graphloc.online._noise import ImuNoise
 from graphloc.online._odometry import Odometry
 from graphloc.online._sensor_noise import SensorNoise
-from graphloc.online._snapshot import Snapshot
+from graphloc.online._snapshot import Snapshot, settings_of
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import UnmodelledError
 
@@ -76,7 +76,7 @@ class PersistentState:
             odometry=Odometry(found.anchor.stamp_ns, found.p_odom_m, found.R_odom_body),
         )
 
-    def snapshot(self, vessel: str, anchor: Anchor, imu: ImuSample, agreed_ns: Mapping[str, int]) -> Snapshot:
+    def snapshot(self, config: VesselConfig, anchor: Anchor, imu: ImuSample, agreed_ns: Mapping[str, int]) -> Snapshot:
         """Return what a run can resume from after its process was killed.
 
         Args:
@@ -85,7 +85,8 @@ class PersistentState:
         assert self.datum is not None
         assert self.odometry is not None
         return Snapshot(
-            vessel=vessel,
+            vessel=config.vessel,
+            settings=settings_of(config),
             anchor=anchor,
             imu=imu,
             datum=self.datum,

@@ -412,14 +412,15 @@ class OnlineSmoother:
             found, self._configured_noise(), {n: setup.config.sensors[n] for n in setup.measuring}
         )
         try:
-            tracking = Tracking(self._setup, persistent, self._ledger, found.anchor, [found.imu, newest])
+            anchor = found.anchor_for(setup.config)
+            tracking = Tracking(self._setup, persistent, self._ledger, anchor, [found.imu, newest])
             persistent.unmodelled = tracking.lag.unmodelled(last=found.unmodelled)
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             self._say(f"the snapshot cannot be used ({in_one_line(error)}): starts without it")
             return
         self._tracking, self._persistent = tracking, persistent
         waiting = [m for m in self._waiting.taken() if m is not newest]
-        tracking.resume(found.anchor, found.imu, newest)
+        tracking.resume(anchor, found.imu, newest)
         self._say(f"resumed from a snapshot {age_s:.1f} s old", warns=False)
         for m in waiting:
             self.feed(m)

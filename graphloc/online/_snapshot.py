@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from graphloc.config import VesselConfig
 from graphloc.errors import in_one_line
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import ImuSample
@@ -18,7 +20,7 @@ from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import ErrorSizes
 from graphloc.solve._batch import LARGEST_NOISE_SCALE
 
-_VERSION = 7
+_VERSION = 8
 _EVERY_S = 2.0
 _MOST_TIMES = 1e4  # of a data sheet's noise, that an IMU on any engine has
 
@@ -34,6 +36,7 @@ class Snapshot:
             and on that of the accelerometer. sensor_noise: those of other sensors' sigmas (`SensorNoise.times`).
         heading: where no sensor measures it, how far it may be off.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
+        settings: by sensor, what the constants in the anchor are added to (`settings_of`).
         unmodelled: sizes of `UnmodelledError`; None where no slow error is left out, and the IMU's mount is right.
     """
 
@@ -48,7 +51,14 @@ class Snapshot:
     heading: UnmeasuredHeading | None
     p_odom_m: Array
     R_odom_body: Array
+    settings: Mapping[str, Any]
     unmodelled: ErrorSizes | None
+
+    def anchor_for(self, config: VesselConfig) -> Anchor:
+        """Return the anchor without the constants of sensors that are set otherwise now: corrected as told, they would be corrected twice."""
+        now = settings_of(config)
+        kept = {of: known for of, known in self.anchor.constants.items() if self.settings[of[0]] == now.get(of[0])}
+        return replace(self.anchor, constants=kept)
 
     def write(self, path: Path) -> None:
         """Replace the file atomically: a kill leaves the old one or the new one.
@@ -67,6 +77,7 @@ class Snapshot:
             "sensor_noise": {name: dict(times) for name, times in self.sensor_noise.items()},
             "heading": None if self.heading is None else asdict(self.heading),
             "agreed_ns": dict(self.agreed_ns),
+            "settings": dict(self.settings),
             "odom": [self.p_odom_m.tolist(), self.R_odom_body.tolist()],
             "unmodelled": None if self.unmodelled is None else [of.tolist() for of in self.unmodelled],
         }
@@ -123,8 +134,15 @@ class Snapshot:
             heading=heading,
             p_odom_m=p,
             R_odom_body=R,
+            settings=dict(raw["settings"]),
             unmodelled=ErrorSizes(*sizes) if sizes else None,
         )
+
+
+def settings_of(config: VesselConfig) -> dict[str, Any]:
+    """Return by sensor, as plain data, where it is taken to sit and by how much its stamps are taken to be off."""
+    said = {"mount", "time_offset_s"}
+    return {name: sensor.model_dump(mode="json", include=said) for name, sensor in config.sensors.items()}
 
 
 class SnapshotFile:

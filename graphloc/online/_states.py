@@ -96,6 +96,7 @@ class States:
                 window.add(slow_begin(stream.slow, key, np.zeros(len(stream.slow.sigma)))
                            if known is None else [anchor.conditional_factor(known, state, key)])  # fmt: skip
                 self._ends[stream.name] = window.add(slow_end(stream.slow, key))
+        constants.begin(anchor, state)
         window.commit()
         self._newest = self._read()
 

@@ -76,7 +76,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     stats = replace(stats, warnings=(*stats.warnings, *unsaid), events=mount_event(result.problem))
     health, reasons = health_over_time(trajectory, since, misfits(problem, result, stats))
     ledger = ledger_of(problem, recording, result.verdicts)
-    corrected = {s.name: corrections(solved_constants(s, result.values)) for s in problem.streams}
+    corrected = {s.name: corrections(solved_constants(s, result.values), s.mount) for s in problem.streams}
     return Solution(
         datum=problem.datum,
         trajectory=trajectory,
@@ -93,7 +93,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         stats=stats,
         time_offsets_s={name: found[TIME_OFFSET] for name, found in corrected.items() if TIME_OFFSET in found},
         antennas_off_m={
-            s.name: off_m for s in problem.streams if (off_m := antenna_off_m(corrected[s.name], s.mount)) is not None
+            name: off_m for name, found in corrected.items() if (off_m := antenna_off_m(found)) is not None
         },
     )
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from graphloc import keys
 from graphloc.build import CONSTANT_TAILS, Problem, Stream, solved_constants
 from graphloc.config import SIGMA_SCALES, SensorConfig
 from graphloc.frames import Array
-from graphloc.graph import Constant, SlowProcess
+from graphloc.graph import Constant, SlowProcess, corrections
 from graphloc.position_jumps import jump_warnings, largest_sigma
 from graphloc.series import runs
 from graphloc.solution import Graded, SolveStats
@@ -235,11 +236,15 @@ def noise_warnings(problem: Problem, result: BatchResult) -> list[str]:
     return warnings
 
 
-def far_off(name: str, constant: Constant, value: Array) -> Iterator[tuple[str, str]]:
-    """Yield each setting of a sensor that is far from where an estimate (k,) of its constant has it, and a line on that."""
-    for key, by, sigma in zip(constant.corrects, value, constant.sigma, strict=False):
+def far_off(name: str, constant: Constant, value: Array, mount: Any) -> Iterator[tuple[str, float, str]]:
+    """Yield each setting of a sensor that is far from where an estimate (k,) of its constant has it: its key, by how much, and a line.
+
+    Args:
+        mount: of the sensor (gtsam.Pose3).
+    """
+    for (key, by), sigma in zip(corrections([(constant, value)], mount).items(), constant.sigma, strict=False):
         if (off := abs(by) / sigma) > FAR_OFF:
-            yield key, f"{name}: {key} is {off:.1f} sigmas from where it is set: add {by:+.3f} to it"
+            yield key, by, f"{name}: {key} is {off:.1f} sigmas from where it is set: add {by:+.3f} to it"
 
 
 def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
@@ -252,11 +257,10 @@ def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     else:
         warnings += _turned_mount(stream, result)
     for constant, value in solved_constants(stream, result.values):
-        warnings += [said for _, said in far_off(stream.name, constant, value)]
-        off = np.abs(value / constant.sigma)
-        if not constant.corrects and off.max() > FAR_OFF:
+        warnings += [said for *_, said in far_off(stream.name, constant, value, stream.mount)]
+        if not constant.corrects and (off := np.abs(value / constant.sigma).max()) > FAR_OFF:
             warnings.append(
-                f"{stream.name}: {constant.name} is {off.max():.1f} sigmas from the survey: survey it again, or raise "
+                f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
                 "its sigmas"
             )
     warnings += slow_error_warning(stream.name, stream.left_out)
