@@ -14,7 +14,7 @@ from graphloc import app
 from graphloc.config import GnssConfig, VelocityConfig
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import Antennas, TruthMetrics, compare_to_held_out, compare_to_truth
-from graphloc.eval.report import verdict
+from graphloc.eval.report import Trust, verdict
 from graphloc.eval.report._theses import _gnss_error_m
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import gnss, velocity
@@ -235,6 +235,18 @@ def test_a_mount_that_was_set_as_told_is_not_corrected_twice(tmp_path: Path) -> 
     resumed = feed(smoother(measured, snapshot=path), measured, came[half:])
     assert any(e.startswith("resumed from a snapshot") for e in resumed.events)
     assert resumed.errors_m[-1] < 0.3
+
+
+def test_the_report_says_that_online_bounds_are_too_small_before_a_turn() -> None:
+    run = displaced(1.0)
+    found = solved(run)
+    online = replace(found.solution, stats=replace(found.solution.stats, online=True))
+    data = app.report_data(replace(found, recording=replace(run.recording, truth=None), online=online))
+    offline_said, online_said = (
+        [reason.trust for reason in track.reasons if "the bounds of the online track are too small" in reason.text]
+        for track in verdict(data).tracks
+    )
+    assert (offline_said, online_said) == ([], [Trust.WITH_CARE])
 
 
 def test_a_snapshot_of_other_constants_is_not_used(tmp_path: Path) -> None:

@@ -199,8 +199,14 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
     bound_m = float(np.median(bounds_95(track.cov)[:, 0]))
     suggestions, checks = (data.calibration.suggestions, data.calibration.checks) if data.calibration else ((), ())
     for name, block in data.config.of_kind("gnss").items():
-        if block.mount_sigma_m > 0.0:
-            continue  # it is estimated, and in the bounds
+        if block.mount_sigma_m > 0.0:  # it is estimated, and in the bounds
+            if solution.stats.online:
+                yield Reason(
+                    trust=Trust.WITH_CARE,
+                    text=f"Where the antenna of {name} sits is estimated (mount_sigma_m): while the vessel has hardly turned, the bounds of the "
+                    "online track are too small for that. Measured, they are right.",
+                )
+            continue
         keys = [f"sensors.{name}.mount.xyz_m[{axis}]" for axis in (0, 1)]
         off_m = math.hypot(*(s.suggested - s.configured for s in suggestions if s.key in keys))
         if off_m > 0.0:
