@@ -202,7 +202,8 @@ def test_a_bow_that_comes_round_against_the_course_turns_no_accelerometer(tmp_pa
             items.append(("/fix", at, make.fix(at, *lla[k])))
     _, config, text = look(tmp_path, items, make)
     imu, compass = config.sensors["imu"], config.sensors["compass"]
-    assert isinstance(imu, ImuConfig) and isinstance(compass, CompassConfig)
+    assert isinstance(imu, ImuConfig)
+    assert isinstance(compass, CompassConfig)
     assert (imu.gravity, compass.convention) == ("included", "enu")
     np.testing.assert_allclose(imu.mount.R_body_sensor[:, 2], (0.0, 0.0, 1.0), atol=1e-6)
     assert "turns against" not in text
