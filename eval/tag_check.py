@@ -35,6 +35,7 @@ _LATE_S, _LATE_EXPLAINS = 0.03, 0.3
 _TURNED_DEG, _STEADY = 6.0, 0.5
 # All tags of a camera elsewhere together.
 _TOGETHER_M = 5.0
+_UPRIGHT = 3.0  # rise over way of an offset of heights; the rest, without tags, is metres off sideways
 # Share of the sightings of a tag in which the vessel is behind its plane, by more than a fix is off; and by how much more than the
 # camera's lever arm she may be farther from it than it looks: else it is not the facing that is wrong, but the place.
 _BEHIND, _BEHIND_M, _PLACE_M = 0.5, 3.0, 5.0
@@ -254,16 +255,29 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
         usual = seen.mean()
         off_deg = float(np.degrees((usual.inv() * Rotation.from_matrix(doubted[0].R_body_camera)).magnitude()))
         scatter_deg = float(np.degrees(np.median((usual.inv() * seen).magnitude())))
-        offs = np.array([_by_tags(m, B) for m, B in zip(doubted, R, strict=True)]) - p
+        # With the attitude that they agree on: where all stand elsewhere, the heading without them may be off as well.
+        as_seen = [replace(m, R_body_camera=usual.as_matrix()) for m in doubted]
+        offs = np.array([_by_tags(m, B) for m, B in zip(as_seen, R, strict=True)]) - p
         moved = np.median(offs, axis=0)
-        if off_deg > _TURNED_DEG and scatter_deg < _STEADY * off_deg:
+        if np.linalg.norm(moved) > _TOGETHER_M and np.median(np.abs(offs - moved)) < 0.1 * np.linalg.norm(moved):
+            lines.append(_all_elsewhere(sensor, camera, moved))
+        elif off_deg > _TURNED_DEG and scatter_deg < _STEADY * off_deg:
             lines.append(_looks_elsewhere(sensor, camera, off_deg, usual))
-        elif np.linalg.norm(moved) > _TOGETHER_M and np.median(np.abs(offs - moved)) < 0.1 * np.linalg.norm(moved):
-            lines.append(
-                f"{sensor}: camera {camera}: its tags all put the vessel {moved[0]:.1f} m east, {moved[1]:.1f} m north, "
-                f"{moved[2]:.1f} m above of where the rest has her: is `datum` the survey's origin?"
-            )
     return lines
+
+
+def _all_elsewhere(sensor: str, camera: str, moved_m: Array) -> str:
+    """Return a line on tags that all put the vessel elsewhere; straight up or down it is the heights of their survey."""
+    upright = abs(float(moved_m[2])) > _UPRIGHT * float(np.hypot(*moved_m[:2]))
+    why = (
+        "are the survey's heights above the geoid, or the sea? Those of world are above the ellipsoid, from height_m of `datum`"
+        if upright
+        else "is `datum` the survey's origin?"
+    )
+    return (
+        f"{sensor}: camera {camera}: its tags all put the vessel {moved_m[0]:.1f} m east, {moved_m[1]:.1f} m north, "
+        f"{moved_m[2]:.1f} m above of where the rest has her: {why}"
+    )
 
 
 def mount_off(solution: Solution, sensor: str, camera: str) -> Rotation:
