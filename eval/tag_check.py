@@ -35,6 +35,8 @@ _LATE_S, _LATE_EXPLAINS = 0.03, 0.3
 _TURNED_DEG, _STEADY = 6.0, 0.5
 # All tags of a camera elsewhere together.
 _TOGETHER_M = 5.0
+_UPSIDE_DOWN = 0.7  # cosine of the angle between up and down by a tag
+_UPRIGHT = 3.0  # rise over way of an offset of heights; the rest, without tags, is metres off sideways
 # Share of the sightings of a tag in which the vessel is behind its plane, by more than a fix is off; and by how much more than the
 # camera's lever arm she may be farther from it than it looks: else it is not the facing that is wrong, but the place.
 _BEHIND, _BEHIND_M, _PLACE_M = 0.5, 3.0, 5.0
@@ -50,6 +52,8 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
     track = solution.trajectory
     sightings = [m for m in recording.of(TagSighting) if track.covers(np.array([m.stamp_ns]))[0]]
     said_of_mounts = list(_estimated_mounts(sightings, solution))
+    if hanging := _upside_down(sightings, config):  # then nothing else that tags say can be judged
+        return hanging
     cameras = {(m.sensor, m.camera) for m in sightings}
     found = {camera: mount_off(solution, *camera).as_matrix() for camera in cameras}
     sightings = [replace(m, R_body_camera=found[m.sensor, m.camera] @ m.R_body_camera) for m in sightings]
@@ -76,6 +80,27 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
         *said_of_mounts,
         *_late(sightings, solution),
         *(f"{sensor}: {surveys[sensor].called(*tag)}: {line}" for (sensor, tag), line in said.items()),
+    ]
+
+
+def _upside_down(sightings: list[TagSighting], config: VesselConfig) -> list[str]:
+    """Return a line for each sensor with tags that look upside down: up is below by them, and a vessel hardly heels.
+
+    Those printed from OpenCV hang so. The track tells nothing of that: it may follow the tags.
+    """
+    level: dict[Key, list[float]] = defaultdict(list)
+    for m in sightings:
+        up_by_mount, up_by_tags = m.R_body_camera[2], m.modes[0].R_world_camera[2]
+        for tag in m.tags:
+            level[m.sensor, tag].append(float(up_by_mount @ up_by_tags))
+    hanging: dict[str, list[str]] = defaultdict(list)
+    for (sensor, tag), own in sorted(level.items()):
+        if len(own) >= _FEWEST and np.median(own) < -_UPSIDE_DOWN:
+            hanging[sensor].append(config.of_kind("apriltag")[sensor].surveyed.called(*tag))
+    return [
+        f"{sensor}: {', '.join(tags)}: upside down, unless the camera is: tags printed from OpenCV hang so, and what would be "
+        "facing_deg: F is then rpy_deg: [-90, 0, -F]; of a camera, mount.rpy_deg"
+        for sensor, tags in hanging.items()
     ]
 
 
@@ -254,16 +279,29 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
         usual = seen.mean()
         off_deg = float(np.degrees((usual.inv() * Rotation.from_matrix(doubted[0].R_body_camera)).magnitude()))
         scatter_deg = float(np.degrees(np.median((usual.inv() * seen).magnitude())))
-        offs = np.array([_by_tags(m, B) for m, B in zip(doubted, R, strict=True)]) - p
+        # With the attitude that they agree on: where all stand elsewhere, the heading without them may be off as well.
+        as_seen = [replace(m, R_body_camera=usual.as_matrix()) for m in doubted]
+        offs = np.array([_by_tags(m, B) for m, B in zip(as_seen, R, strict=True)]) - p
         moved = np.median(offs, axis=0)
-        if off_deg > _TURNED_DEG and scatter_deg < _STEADY * off_deg:
+        if np.linalg.norm(moved) > _TOGETHER_M and np.median(np.abs(offs - moved)) < 0.1 * np.linalg.norm(moved):
+            lines.append(_all_elsewhere(sensor, camera, moved))
+        elif off_deg > _TURNED_DEG and scatter_deg < _STEADY * off_deg:
             lines.append(_looks_elsewhere(sensor, camera, off_deg, usual))
-        elif np.linalg.norm(moved) > _TOGETHER_M and np.median(np.abs(offs - moved)) < 0.1 * np.linalg.norm(moved):
-            lines.append(
-                f"{sensor}: camera {camera}: its tags all put the vessel {moved[0]:.1f} m east, {moved[1]:.1f} m north, "
-                f"{moved[2]:.1f} m above of where the rest has her: is `datum` the survey's origin?"
-            )
     return lines
+
+
+def _all_elsewhere(sensor: str, camera: str, moved_m: Array) -> str:
+    """Return a line on tags that all put the vessel elsewhere; straight up or down it is the heights of their survey."""
+    upright = abs(float(moved_m[2])) > _UPRIGHT * float(np.hypot(*moved_m[:2]))
+    why = (
+        "are the survey's heights above the geoid, or the sea? Those of world are above the ellipsoid, from height_m of `datum`"
+        if upright
+        else "is `datum` the survey's origin?"
+    )
+    return (
+        f"{sensor}: camera {camera}: its tags all put the vessel {moved_m[0]:.1f} m east, {moved_m[1]:.1f} m north, "
+        f"{moved_m[2]:.1f} m above of where the rest has her: {why}"
+    )
 
 
 def mount_off(solution: Solution, sensor: str, camera: str) -> Rotation:

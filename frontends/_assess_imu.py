@@ -30,6 +30,8 @@ from graphloc.white_noise import white_noise
 
 # Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
 _COURSE_S, _COURSE_CLEAR, _LEFT_OF_TURNS = 12.0, 0.6, 0.5
+# To this factor a course turns as the craft does, either way; where she is set sideways while her bow comes round, by a fifth of it.
+_AS_MUCH = 2.0
 _UPSIDE_DOWN_DEG = 150.0
 # Quiet seconds in a row; for how long it is slow, at most, that only changes its direction.
 _QUIET_S, _STANDS_S = 2, 1.5
@@ -208,7 +210,7 @@ def _against_courses(imu: TopicData, report: ImuReport, courses: Courses | None,
     if courses is None or len(courses.stamps_ns) < 20:
         return 0
     turning, course = turning_of(imu, report, tree, body), np.unwrap(courses.course_rad)
-    return against_turning(turning, courses.stamps_ns, course, _COURSE_S, _COURSE_CLEAR)
+    return against_turning(turning, courses.stamps_ns, course, _COURSE_S, _COURSE_CLEAR, _AS_MUCH)
 
 
 def _turning_axis(

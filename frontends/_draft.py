@@ -507,7 +507,9 @@ def _mount_lines(compass: CompassReport) -> list[str]:
     if sigma > _TURNED_DEG:
         quarter = 90.0 * round(compass.offset_deg / 90.0)
         rest = abs(compass.offset_deg - quarter)
-        yaw, sigma = (quarter, rest) if rest < 15.0 else (round(compass.offset_deg), _LEEWAY_DEG)
+        # Of a vessel that is set sideways by turns, the mean course is no better than that.
+        askew = round(compass.offset_deg), max(_LEEWAY_DEG, compass.scatter_deg or 0.0)
+        yaw, sigma = (quarter, rest) if rest < 15.0 else askew
         why = "a course is no heading, and tells no more"
         astern = ", unless the vessel goes astern most of the time: then 0" if abs(yaw) > _ASTERN_DEG else ""
         lines.append(

@@ -27,13 +27,19 @@ class Turning:
 
 
 def against_turning(
-    turning: Turning | None, at_ns: NDArray[np.int64], angle: Array, over_s: float = 2.0, clear: float = 0.5
+    turning: Turning | None,
+    at_ns: NDArray[np.int64],
+    angle: Array,
+    over_s: float = 2.0,
+    clear: float = 0.5,
+    as_much: float = np.inf,
 ) -> int:
     """Return +1 where an angle grows as the craft turns to port, -1 where it falls, 0 where nothing tells.
 
     Args:
         at_ns: (N,), increasing. angle: (N,) rad, unwrapped. over_s: time over which changes are compared: a gyro's bias
-            must be small beside them, and the angle's noise average out. clear: correlation that is believed.
+            must be small beside them, and the angle's noise average out. clear: correlation that is believed. as_much: factor to
+            which the angle turns by as much as the craft does.
     """
     at, own, turned = _beside(turning, at_ns, angle)
     if len(at) < 20:
@@ -41,8 +47,11 @@ def against_turning(
     step = max(1, round(over_s / max(float(np.median(np.diff(at))), 1e-3)))
     a, b = (v[step:] - v[:-step] for v in (own, turned))
     power = float(np.sqrt((a**2).sum() * (b**2).sum()))
-    together = float((a * b).sum()) / power if power > 0.0 else 0.0
-    return int(np.sign(together)) if abs(together) > clear else 0
+    together = float((a * b).sum())
+    if not abs(together) > clear * power:
+        return 0
+    slope = abs(together) / float((b**2).sum())  # noise of the angle averages out, and the gyroscope has hardly any
+    return int(np.sign(together)) if 1.0 / as_much <= slope <= as_much else 0
 
 
 def left_of_turns(turning: Turning, at_ns: NDArray[np.int64], angle: Array, over_s: float) -> float:

@@ -116,6 +116,9 @@ class BerthConfig(Block):
 class Survey(Block):
     """A whole `tags.yaml`."""
 
+    grid: Annotated[str, Field(pattern=r"^(EPSG:\d{4,6})?$")] = ""
+    """Map grid of all places in world, e.g. `EPSG:32632` for UTM zone 32 north: `xyz_m` are then easting, northing and height above the
+    ellipsoid, m, and directions count from grid north. Empty: east, north, up from the datum, and true north."""
     tags: tuple[TagConfig, ...] = ()
     """The tags; ids are unique within a family."""
     docks: tuple[DockConfig, ...] = ()

@@ -83,6 +83,15 @@ def test_one_match_is_drawn(
     assert (np.abs(drawn.astype(int) - (60, 60, 255)).max(axis=2) < 3).sum() > 500  # its faces
 
 
+def test_one_match_is_of_one_scan(bag: Path) -> None:
+    """Others, placed by a track of fixes that jump, drew each boat twice, and the best mode was over a metre off with a probability of 0.9."""
+    recording, vessel = loaded(bag)
+    assert vessel.sensors["aerial"].around_s > 0.0
+    match, _ = app.match_at(recording, vessel, app.Scans((bag / "run",), bag), 10.0, lambda *_: None)
+    assert match.found.turns == 1
+    assert match.found.own is None
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

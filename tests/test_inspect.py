@@ -182,6 +182,33 @@ def test_accelerations_of_the_wrong_sign_are_found(z_down: bool, tmp_path: Path)
     np.testing.assert_allclose(np.median(series.accel_mps2, axis=0) @ R.T, (0.0, 0.0, G), atol=0.5)
 
 
+def test_a_bow_that_comes_round_against_the_course_turns_no_accelerometer(tmp_path: Path) -> None:
+    """Coming alongside, she turns by 95 deg to starboard while her course bends by 20 to port: her IMU was drafted on its back."""
+    make, items, rng, rate_hz = Messages(2), [], np.random.default_rng(1), 50
+    t = np.arange(0.0, 45.0, 1.0 / rate_hz)
+    done = np.clip((t - 18.0) / 15.0, 0.0, 1.0)
+    done = done**2 * (3.0 - 2.0 * done)
+    course, yaw = np.radians(-90.0 + 20.0 * done), np.radians(-90.0 - 95.0 * done)
+    velocity = np.interp(t, [0.0, 15.0, 33.0, 45.0], [4.0, 3.0, 0.6, 0.6]) * np.exp(1j * course)
+    place = np.cumsum(velocity) / rate_hz
+    felt, turns = np.gradient(velocity, t) * np.exp(-1j * yaw), np.gradient(yaw, t)
+    noise = 0.3 * rng.normal(size=(len(t), 3))
+    lla = DATUM.geodetic_from_enu(np.column_stack([place.real, place.imag, 0.0 * t]) + noise)
+    for k in range(len(t)):
+        at = START_NS + k * S // rate_hz
+        items.append(("/imu", at, make.imu(at, (felt[k].real, felt[k].imag, G), (0.0, 0.0, turns[k]))))
+        if k % 10 == 0:
+            items.append(("/compass", at, make.compass(at, (0.0, 0.0, np.sin(0.5 * yaw[k]), np.cos(0.5 * yaw[k])))))
+            items.append(("/fix", at, make.fix(at, *lla[k])))
+    _, config, text = look(tmp_path, items, make)
+    imu, compass = config.sensors["imu"], config.sensors["compass"]
+    assert isinstance(imu, ImuConfig)
+    assert isinstance(compass, CompassConfig)
+    assert (imu.gravity, compass.convention) == ("included", "enu")
+    np.testing.assert_allclose(imu.mount.R_body_sensor[:, 2], (0.0, 0.0, 1.0), atol=1e-6)
+    assert "turns against" not in text
+
+
 @pytest.mark.parametrize(
     ("accel", "gyro", "gravity", "words"),
     [
@@ -259,6 +286,7 @@ def test_standard_receiver_gets_a_slow_error(tmp_path: Path) -> None:
         (90.0, 2.0, True, 90.0, 1.0),
         (98.0, 2.0, True, 90.0, 8.0),
         (40.0, 2.0, True, 40.0, 5.0),
+        (25.0, 12.0, True, 25.0, 11.0),  # of a leeway that varies by 12 deg the mean is not known to 5
         (172.0, 2.0, True, 180.0, 8.0),
         (0.0, 60.0, False, 0.0, 0.0),
     ],

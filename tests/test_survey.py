@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import Transformer
 
 from graphloc.config import AprilTagConfig, CompassConfig, VesselConfig
 from graphloc.errors import ConfigError
@@ -238,3 +239,68 @@ def test_corners_turn_with_the_tag() -> None:
     tag = TagConfig.model_validate({"id": 0, "size_m": 2.0, "xyz_m": [1, 2, 3], "rpy_deg": [0, 0, 0]})
     expected: Array = np.array([(0.0, 3.0, 3.0), (2.0, 3.0, 3.0), (2.0, 1.0, 3.0), (0.0, 1.0, 3.0)])
     np.testing.assert_allclose(tag.corners_m, expected, atol=1e-12)
+
+
+IN_GRID = """grid: {grid}
+tags:
+- {{id: 3, size_m: 0.4, xyz_m: [{east}, {north}, {up}], facing_deg: 180}}
+- {{id: 4, size_m: 0.4, xyz_m: [{east}, {north}, {up}], rpy_deg: [90, 0, 30]}}
+- {{id: 5, size_m: 0.4, frame: d, xyz_m: [1, 2, 3], facing_deg: 180}}
+docks:
+- {{name: d, xyz_m: [{east}, {north}, {up}], rpy_deg: [0, 0, 20]}}
+berths:
+- {{name: b, xyz_m: [{east}, {north}, {up}], facing_deg: 90}}
+"""
+UTM_33 = {"latitude_deg": 57.7, "longitude_deg": 11.9, "height_m": 40.0}
+
+
+def in_grid(folder: Path, datum: dict[str, float] | None = UTM_33, **changes: object) -> Survey:
+    longitude, latitude = 11.9 + 0.002, 57.7 + 0.001
+    east, north = Transformer.from_crs(4326, 32633, always_xy=True).transform(longitude, latitude)
+    written(folder, IN_GRID.format(**{"grid": "EPSG:32633", "east": east, "north": north, "up": 43.0, **changes}))
+    tags = AprilTagConfig(survey="tags.yaml")
+    config = VesselConfig.model_validate({"sensors": {}, **({"datum": datum} if datum else {})})
+    config = config.model_copy(update={"sensors": {"tags": tags}})
+    sensor = with_surveys(config, folder).sensors["tags"]
+    assert isinstance(sensor, AprilTagConfig)
+    return sensor.surveyed
+
+
+def test_a_survey_in_a_grid_is_turned_by_the_convergence_there(tmp_path: Path) -> None:
+    """Its places and directions, but not those on a dock; by the radii of curvature of the ellipsoid, and Snyder's convergence."""
+    survey = in_grid(tmp_path)
+    a, e2, lat = 6378137.0, 0.00669437999014, np.radians(57.7005)
+    across = a / np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
+    along = a * (1.0 - e2) / (1.0 - e2 * np.sin(lat) ** 2) ** 1.5
+    east, north = np.radians(0.002) * across * np.cos(np.radians(57.701)), np.radians(0.001) * along
+    grid_north_deg = np.degrees(np.arctan(np.tan(np.radians(11.902 - 15.0)) * np.sin(np.radians(57.701))))
+    assert grid_north_deg == pytest.approx(
+        -2.62, abs=0.01
+    )  # meridians lean to the zone's middle, which is east of here
+    free, turned, riding = survey.tags
+    np.testing.assert_allclose(free.xyz_m, (east, north, 3.0), atol=0.02)
+    assert free.facing_deg == pytest.approx(180.0 + grid_north_deg, abs=0.01)
+    assert turned.rpy_deg == pytest.approx((90.0, 0.0, 30.0 - grid_north_deg), abs=0.01)
+    assert (riding.xyz_m, riding.facing_deg) == ((1.0, 2.0, 3.0), 180.0)
+    np.testing.assert_allclose(survey.docks[0].xyz_m, free.xyz_m)
+    assert survey.docks[0].rpy_deg == pytest.approx((0.0, 0.0, 20.0 - grid_north_deg), abs=0.01)
+    np.testing.assert_allclose(survey.berths[0].xyz_m, free.xyz_m)
+    assert survey.berths[0].facing_deg == pytest.approx(90.0 + grid_north_deg, abs=0.01)
+    assert survey.grid == ""  # the one of the run folder is in world
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"grid": "EPSG:99999"}, "grid EPSG:99999 is not known"),
+        ({"grid": "EPSG:4326"}, "does not count metres"),
+        ({"grid": "EPSG:2263"}, "does not count metres"),  # feet
+        ({"east": 1e12}, "tag 3: 1e+12, "),
+        ({"datum": None}, "needs a `datum:`"),
+    ],
+)
+def test_a_survey_in_a_grid_that_is_none_is_one_line(changes: dict[str, object], said: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"tags\.yaml: ") as caught:
+        in_grid(tmp_path, **changes)  # type: ignore[arg-type]
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -376,6 +376,38 @@ def test_a_quay_that_is_off_is_not_taken_for_tags_that_face_the_other_way() -> N
     assert "from behind" not in said
 
 
+@pytest.mark.parametrize("hanging", [(226, 227, 228), (227,)], ids=["all", "one"])
+def test_tags_that_hang_upside_down_are_named(hanging: tuple[int, ...]) -> None:
+    """As those printed from OpenCV do: of eight warnings none said so, of the camera that it looks 117 deg elsewhere."""
+
+    def turned(tag: TagConfig) -> TagConfig:
+        if tag.id not in hanging:
+            return tag
+        heading = float(np.degrees(np.arctan2(*tag.R_frame_tag[:2, 2])))  # of its face
+        told = tag.model_copy(update={"rpy_deg": (-90.0, 0.0, -heading), "facing_deg": None})
+        half_turn = Rotation.from_matrix(tag.R_frame_tag.T @ told.R_frame_tag).as_rotvec(degrees=True)
+        np.testing.assert_allclose(np.abs(half_turn), (0.0, 0.0, 180.0), atol=1.0)  # plates hang askew by that
+        return told
+
+    said = dock(tag=turned, lasts_s=20.0, rate_hz=1.0, route_s=30.0).said
+    (line,) = [line for line in said.splitlines() if "upside down" in line]
+    assert line.startswith(f"tags: {', '.join(f'tag {number}' for number in hanging)}: upside down")
+    assert "rpy_deg: [-90, 0, -F]" in line
+    assert "elsewhere than its mount says" not in said
+
+
+def test_a_survey_of_heights_above_the_geoid_is_named() -> None:
+    """25 m below the ellipsoid; where the compass is off by 10 deg, it was said that the camera looks 8 deg elsewhere."""
+    turned_compass = lambda m: replace(m, yaw_rad=m.yaw_rad + np.radians(10.0)) if isinstance(m, CompassHeading) else m
+    lower = lambda t: t.model_copy(update={"xyz_m": (t.xyz_m[0], t.xyz_m[1], t.xyz_m[2] - 25.0)})
+    said = dock(tag=lower, change=turned_compass, lasts_s=20.0, rate_hz=1.0, route_s=30.0).said
+    (line,) = [line for line in said.splitlines() if "its tags all put the vessel" in line]
+    assert "heights above the geoid" in line
+    up_m = float(line.split(" m above")[0].split()[-1])
+    assert up_m == pytest.approx(-25.0, abs=2.0)
+    assert "elsewhere than its mount says" not in said
+
+
 def test_one_tag_of_another_size_is_named() -> None:
     """0.162 m, the default of a well-known example, where 0.412 m hangs; one id in two families is two tags.
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from graphloc import app
+from graphloc.config import AerialConfig, AprilTagConfig
 from graphloc.eval.calibrate import Calibration, Check, Suggestion
 from graphloc.eval.ekf import FilterResult
 from graphloc.eval.metrics import Antennas, Table
@@ -14,7 +15,7 @@ from graphloc.eval.report import ReportData, Trust, durations_s, stretches, verd
 from graphloc.eval.report._health import cure, section
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frozen_receiver import WHY
-from graphloc.ledger import Ledger, Outcome
+from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import GnssPosition
 from graphloc.solution import Cause, Health, HealthReason, Solution
 from graphloc.solve._health import health_of
@@ -114,6 +115,26 @@ def test_an_antenna_that_is_elsewhere_or_was_left_at_the_guess_is_said(data: Rep
     trust, (text,) = antenna_at(data, 0.0)
     assert trust is Trust.WITH_CARE
     assert "nothing here checks that" in text
+
+
+@pytest.mark.parametrize(
+    ("mount", "said"), [({}, True), ({"xyz_m": (0.0, 0.0, 2.4)}, False), ({"tf_frame": "bow"}, False)], ids=["left", "given", "tf"]
+)  # fmt: skip
+@pytest.mark.parametrize("key", ["cameras", "lidars"])
+def test_a_camera_or_lidar_that_was_left_at_the_guess_is_said(
+    data: ReportData, key: str, mount: dict[str, object], *, said: bool
+) -> None:
+    """The track was off by where the camera sits, 2.5 m, with bounds of 0.1 m, and nothing was said."""
+    block = {"bow": {"topic": "/bow", "mount": mount}}
+    sensor = (AprilTagConfig if key == "cameras" else AerialConfig).model_validate({key: block})
+    config = data.config.model_copy(update={"sensors": {**data.config.sensors, "quay": sensor}})
+    used = LedgerRow(seq=10**9, stamp_ns=0, sensor="quay", topic="", outcome=Outcome.USED)
+    solution = replace(data.solution, ledger=Ledger([*data.solution.ledger, used]))
+    recording = replace(data.recording, truth=None)
+    (track, _) = verdict(replace(data, config=config, recording=recording, solution=solution)).tracks
+    assert any(f"at the vessel's origin: {key}.bow of quay" in r.text for r in track.reasons) == said
+    (track, _) = verdict(replace(data, config=config, recording=recording)).tracks
+    assert not any("cameras" in r.text or "lidars" in r.text for r in track.reasons)  # nothing of it is used
 
 
 @pytest.mark.parametrize(

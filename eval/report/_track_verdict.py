@@ -93,7 +93,8 @@ def track_verdict(data: ReportData, solution: Solution) -> TrackVerdict:
     """
     reasons = (
         *_bounds(data, solution), *_far_from_fixes(data, solution), *_late(data, solution), *_levers(data, solution),
-        *_beside(data, solution), *_from_offline(data, solution), *_compared(data, solution), *_solved(data, solution),
+        *_origins(data, solution), *_beside(data, solution), *_from_offline(data, solution), *_compared(data, solution),
+        *_solved(data, solution),
     )  # fmt: skip
     return TrackVerdict(name=solution.name, accuracy=_accuracy(data, solution.name), reasons=reasons)
 
@@ -223,6 +224,23 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
                 trust=Trust.YES if known_m is not None and known_m < bound_m else Trust.WITH_CARE,
                 text=f"The antenna of {name} is taken to be at the vessel's origin (mount.xyz_m is 0, as `inspect` drafts it); where it is "
                 f"not, the track is off by as much, which no bound includes; {said}.",
+            )
+
+
+def _origins(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """Yield the cameras and LiDARs that were left at the vessel's origin: what they see places the vessel, and nothing else tells."""
+    if data.recording.truth is not None:
+        return
+    for name in (*data.config.of_kind("apriltag"), *data.config.of_kind("aerial")):
+        sensor = data.config.sensors[name]
+        key = "cameras" if sensor.kind == "apriltag" else "lidars"
+        mounts = {device: block.mount for device, block in getattr(sensor, key).items()}
+        left = [f"{key}.{device}" for device, mount in mounts.items() if not mount.tf_frame and not any(mount.xyz_m)]
+        if left and solution.ledger.used(name):
+            yield Reason(
+                trust=Trust.WITH_CARE,
+                text=f"Taken to be at the vessel's origin: {', '.join(left)} of {name} (mount.xyz_m is 0, as `inspect` drafts it). Where "
+                "that is not so, the track is off by as much, which no bound includes.",
             )
 
 

@@ -245,16 +245,17 @@ def match_at(
 ) -> tuple[Match, int]:
     """Match the scan nearest to a time (s since the first IMU sample) around the run smoothed without matches.
 
+    It is matched alone, as in the first pass of a run: placed by a track without matches, others would smear it where GNSS drifts or jumps.
+
     Returns:
         The match, and its stamp (ns).
 
     Raises:
         InputError: no aerial sensor is switched on, or it cannot work there.
     """
-    sensors = config.of_kind("aerial")
-    if not sensors:
+    if not config.of_kind("aerial"):
         raise InputError("no sensor of kind aerial is enabled: set `enabled: true` in its block")
-    (sensor, *_) = sensors.values()
+    (sensor, *_) = _matched_alone(config).of_kind("aerial").values()
     datum = choose_datum(recording, config)
     whole = with_synthetic(recording, config, datum)
     track = solve(whole, config, datum, progress=progress).trajectory

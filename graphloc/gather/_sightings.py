@@ -10,7 +10,9 @@ from pathlib import Path
 
 from graphloc.config import VesselConfig
 from graphloc.errors import ConfigError
+from graphloc.frames import Datum
 from graphloc.frontends._part import Bags
+from graphloc.frontends.tags.grid import in_world
 from graphloc.frontends.tags.sightings import camera_info_topic, sightings_of_bag
 from graphloc.frontends.tags.sizes import size_factors
 from graphloc.gather._gathering import Gathering
@@ -33,8 +35,19 @@ def with_surveys(config: VesselConfig, folder: Path) -> VesselConfig:
         if not sensor.survey:
             raise ConfigError(f"sensors.{name}.survey: name the tags.yaml that says where the tags are (docs/tags.md)")
         if isinstance(sensor.survey, str):
-            read[name] = sensor.model_copy(update={"survey": load_survey(folder / sensor.survey)})
+            survey = _in_world(load_survey(folder / sensor.survey), config, folder / sensor.survey)
+            read[name] = sensor.model_copy(update={"survey": survey})
     return config.with_sensors(read)
+
+
+def _in_world(survey: Survey, config: VesselConfig, path: Path) -> Survey:
+    """Return a survey in world; `path` is named in errors."""
+    if survey.grid and config.datum is None:
+        raise ConfigError(f"{path}: a survey in a grid needs a `datum:` in vessel.yaml, any place near by")
+    try:
+        return in_world(survey, Datum(config.datum.geodetic)) if config.datum else survey
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def with_sightings(recording: Recording, config: VesselConfig, bags: Bags, progress: Progress) -> Recording:

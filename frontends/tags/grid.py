@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A survey in a map grid, as surveyors give it: its tags, docks and berths in world."""
+
+from __future__ import annotations
+
+import numpy as np
+from pyproj import CRS
+from pyproj.exceptions import ProjError
+from pyproj.transformer import AreaOfInterest, Transformer
+
+from graphloc.frames import Array, Datum
+from graphloc.survey import WORLD, Survey
+
+_AHEAD_M = 10.0  # over which the direction of grid north is taken
+
+
+def in_world(survey: Survey, datum: Datum) -> Survey:
+    """Return a survey whose places are east, north, up from a datum; as it is, if they are already.
+
+    Grid north is not true north, and a metre of a grid not always a metre: each place is converted by itself, and each direction by
+    that of grid north there. Places and directions on a dock are the dock's, as before.
+
+    Raises:
+        ValueError: the grid is unknown or does not count metres, or a place is not in it.
+    """
+    if not survey.grid:
+        return survey
+    grid = _Grid(survey.grid, datum)
+    tags, docks, berths = [], [], []
+    for tag in survey.tags:
+        if tag.frame == WORLD:
+            xyz_m, north_deg = grid.placed(f"tag {tag.id}", tag.xyz_m)
+            turned = {"rpy_deg": _yawed(tag.rpy_deg, north_deg)} if tag.rpy_deg else {}
+            facing = {"facing_deg": tag.facing_deg + north_deg} if tag.facing_deg is not None else {}
+            tag = tag.model_copy(update={"xyz_m": xyz_m, **turned, **facing})
+        tags.append(tag)
+    for dock in survey.docks:
+        xyz_m, north_deg = grid.placed(f"dock {dock.name}", dock.xyz_m)
+        docks.append(dock.model_copy(update={"xyz_m": xyz_m, "rpy_deg": _yawed(dock.rpy_deg, north_deg)}))
+    for berth in survey.berths:
+        if berth.frame == WORLD:
+            xyz_m, north_deg = grid.placed(f"berth {berth.name}", berth.xyz_m)
+            berth = berth.model_copy(update={"xyz_m": xyz_m, "facing_deg": berth.facing_deg + north_deg})
+        berths.append(berth)
+    return survey.model_copy(update={"grid": "", "tags": tuple(tags), "docks": tuple(docks), "berths": tuple(berths)})
+
+
+class _Grid:
+    """A map grid, seen from a datum."""
+
+    def __init__(self, name: str, datum: Datum) -> None:
+        longitude = datum.origin.longitude_deg
+        longitude -= 360.0 if longitude > 180.0 else 0.0  # a datum may say 190 deg, PROJ's areas may not
+        here = AreaOfInterest(longitude, datum.origin.latitude_deg, longitude, datum.origin.latitude_deg)
+        try:
+            crs = CRS.from_user_input(name)
+            self._to_geodetic = Transformer.from_crs(crs, 4326, always_xy=True, area_of_interest=here)
+        except ProjError:
+            raise ValueError(f"grid {name} is not known") from None
+        if not crs.is_projected or any(axis.unit_name != "metre" for axis in crs.axis_info[:2]):
+            raise ValueError(f"grid {name} ({crs.name}) does not count metres east and north")
+        self._name, self._datum = name, datum
+
+    def placed(self, what: str, xyz_m: tuple[float, float, float]) -> tuple[tuple[float, float, float], float]:
+        """Return a place (easting, northing, height above the ellipsoid) in world, and where grid north points there, deg from north."""
+        east, north, height = xyz_m
+        here, ahead = self._world(np.array([[east, north, height], [east, north + _AHEAD_M, height]]))
+        if not np.isfinite([here, ahead]).all():
+            raise ValueError(f"{what}: {east:g}, {north:g} is not in the grid {self._name}")
+        x, y, z = here.tolist()
+        way = ahead - here
+        return (x, y, z), float(np.degrees(np.arctan2(way[0], way[1])))
+
+    def _world(self, in_grid_m: Array) -> Array:
+        longitude, latitude = self._to_geodetic.transform(in_grid_m[:, 0], in_grid_m[:, 1])
+        return self._datum.enu_from_geodetic(np.asarray(latitude), np.asarray(longitude), in_grid_m[:, 2])
+
+
+def _yawed(rpy_deg: tuple[float, float, float], north_deg: float) -> tuple[float, float, float]:
+    """Return an attitude in world of one in a grid whose north is so far clockwise of true north."""
+    roll, pitch, yaw = rpy_deg
+    return roll, pitch, yaw - north_deg
