@@ -42,8 +42,8 @@ _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset a
 _LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images as they come
 _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
-# Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
 _ANTENNA_OFF_M = 1.0  # from the IMU: of a car; 4 m on a boat or 0.3 m on a robot are found with it as well
+# Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
 _RTK_M = (0.05, 0.1)
 _RTK_SCATTER_M = 0.1
 _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off: else a wrong fix draws the track along
