@@ -4,9 +4,9 @@
     z = (p + R l)_up + d^2 / 2 R_earth - t + w,   w ~ N(0, s^2)
 
 p, R: state in world; l: body origin from it; d: horizontal distance from the datum, since the sea falls below its tangent plane
-(2 m at 5 km), taken from the estimate at every pass; t: rise of the vessel by tide and load, a slow state. Modelled as noise,
-a tide of 0.2 m is contradicted 120 times in two minutes, and biases the height that tags on a quay give. Without t: a native
-`GPSFactorArm` whose horizontal sigmas are 1 km.
+(2 m at 5 km), taken from the estimate at every pass; t: rise of the vessel by tide and load, and what the fixes' median is off by
+where it stands for the height, a slow state. Modelled as noise, a tide of 0.2 m is contradicted 120 times in two minutes, and
+biases the height that tags on a quay give. Without t: a native `GPSFactorArm` whose horizontal sigmas are 1 km.
 """
 
 from __future__ import annotations
@@ -78,15 +78,15 @@ def ideal(at: Attachment, config: HeightConfig) -> HeightPrior:
 
 
 def slow(config: HeightConfig) -> SlowProcess | None:
-    """Return the rise by tide and load, as configured; None if it is not modelled."""
-    if config.tide_sigma_m == 0.0:
+    """Return the rise by tide and load, and what the configured height is off by; None if nothing of that is modelled."""
+    if config.offset_sigma_m == 0.0:
         return None
     return SlowProcess(
         name="tide and load",
         axes=("up",),
         units=("m",),
         scale=np.ones(1),
-        sigma=np.array([config.tide_sigma_m]),
+        sigma=np.array([config.offset_sigma_m]),
         time_constant_s=np.array([_TIDE_S]),
     )
 

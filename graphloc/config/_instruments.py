@@ -6,6 +6,7 @@ Data-sheet units live here only, and become SI in the properties.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 import numpy as np
@@ -242,10 +243,17 @@ class HeightConfig(SensorConfig):
     """Heave around that height, 1 sigma, m."""
     tide_sigma_m: NonNegative = 0.5
     """Offset by tide and load, lasting for hours, 1 sigma, m; 0: none."""
+    median_sigma_m: NonNegative = 5.0
+    """Error of the fixes' median, where `height_m` is empty, 1 sigma, m: their slow error lasts longer than most runs. With RTK the fixes themselves tell better."""
     period_s: Annotated[float, Field(ge=0.02, le=1e6)] = 1.0
     """Time between two priors, s."""
     kernel: KernelConfig = KernelConfig(kind="none")
     """Robust loss: not used for the height prior."""
+
+    @property
+    def offset_sigma_m(self) -> float:
+        """Of all that lasts: tide and load, and the median that stands for the height, 1 sigma, m."""
+        return math.hypot(self.tide_sigma_m, self.median_sigma_m if self.height_m is None else 0.0)
 
     @property
     def synthetic_every_s(self) -> float:

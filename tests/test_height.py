@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The height of a vessel that floats, where the fixes' median stands for it."""
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.config import HeightConfig
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors.height import slow
+from graphloc.measurements import GnssPosition, Measurement
+from graphloc.replay import replay
+from graphloc.trajectory import Trajectory, bounds_95
+from tests.slowly import with_few_states
+
+UP_M = 4.0  # a slow error of height that lasts longer than the run
+
+
+def raised(sigma_m: float) -> SimulatedRun:
+    run = simulate(Scenario(duration_s=30.0, noise="clean", imu_hz=50.0, gnss_hz=2.0), 3)
+
+    def up(m: Measurement) -> Measurement:
+        if not isinstance(m, GnssPosition):
+            return m
+        return replace(m, position=m.position._replace(height_m=m.position.height_m + UP_M))
+
+    height = HeightConfig(median_sigma_m=sigma_m)
+    config = with_few_states(run.config.with_sensors({"height": height}), 2.5)
+    return replace(run, recording=run.recording.changed(up), config=config)
+
+
+def in_bounds(track: Trajectory, truth: Trajectory) -> float:
+    """Return for which share of the states the height is inside its bound."""
+    assert track.cov is not None
+    both = truth.covers(track.stamps_ns)
+    off_m = np.abs(track.p_world_m[both, 2] - truth.at(track.stamps_ns[both]).p_world_m[:, 2])
+    return float((off_m < bounds_95(track.cov[both])[:, 1]).mean())
+
+
+@pytest.mark.parametrize("mode", ["offline", "online"])
+def test_the_median_of_fixes_is_no_better_than_their_slow_error(mode: Literal["offline", "online"]) -> None:
+    """Believed to a tide, it was 4 m off with bounds of 1 m."""
+    inside = []
+    for sigma_m in (0.0, 5.0):
+        run = raised(sigma_m)
+        found = app.simulated(run).solution if mode == "offline" else replay(run.recording, run.config).solution
+        inside.append(in_bounds(found.trajectory, run.truth))
+    assert inside == [0.0, 1.0]
+
+
+@pytest.mark.parametrize(("height_m", "sigma_m"), [(None, np.hypot(0.5, 5.0)), (7.0, 0.5)])
+def test_a_configured_height_is_off_by_tide_and_load_alone(height_m: float | None, sigma_m: float) -> None:
+    process = slow(HeightConfig(height_m=height_m))
+    assert process is not None
+    assert process.sigma == pytest.approx(sigma_m)
