@@ -101,8 +101,9 @@ class Constants:
         """Yield each setting of a stream that is clearly far from where the window has it, and a line on that."""
         for constant, key in zip(stream.constants, constant_keys(stream), strict=True):
             if constant.corrects and self._window.is_committed(key):
-                value, sigma = self._window.values.atVector(key), np.sqrt(np.diag(self._window.covariance([key])))
+                value = self._window.values.atVector(key)
                 for setting, by, said in far_off(stream.name, constant, value, stream.mount):
+                    sigma = np.sqrt(np.diag(self._window.covariance([key])))
                     # Of a place the largest: a mount may turn its axes.
                     unsure = sigma[-3:].max() if setting in PLACE else sigma[constant.corrects.index(setting)]
                     if abs(by) > FAR_OFF * unsure:
