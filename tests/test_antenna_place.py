@@ -21,6 +21,7 @@ from graphloc.factors import gnss, velocity
 from graphloc.frames import Array, wrap_angle
 from graphloc.graph import PLACE, Attachment, Decision, Sensor, antenna_off_m, corrections
 from graphloc.linear import factors_of
+from graphloc.measurements import GnssPosition, Measurement
 from graphloc.replay import replay
 from tests.faults import Fed, arrivals_of, feed
 from tests.slowly import with_few_states
@@ -230,6 +231,25 @@ def test_a_vessel_that_lies_still_is_no_surer_of_its_place_after_restarts(tmp_pa
         fed = feed(smoother(run, snapshot=path), run, came[part[0] : part[-1] + 1])
     assert any(event.startswith("resumed from a snapshot") for event in fed.events)
     assert fed.estimates[-1].bound_95_m > 0.8 * whole.bound_95_m
+
+
+def test_a_vessel_that_lies_still_is_no_surer_of_its_place_after_outages() -> None:
+    """The antenna's place left the window in each, and was told again after it: fewer fixes made the bound smaller."""
+    lying = replace(SCENARIO, path="still", duration_s=40.0, wave_roll_deg=0.2, wave_pitch_deg=0.2, wave_heave_m=0.02)
+    run = displaced(1.0, scenario=lying)
+    begin_ns = int(run.truth.stamps_ns[0])
+
+    def lost(m: Measurement) -> bool:
+        return isinstance(m, GnssPosition) and any(
+            t < (m.stamp_ns - begin_ns) * 1e-9 < t + 5.0 for t in (10, 17, 24, 31)
+        )
+
+    heard = replace(run.recording, measurements=tuple(m for m in run.recording.measurements if not lost(m)))
+    cut = replace(run, recording=heard)
+    whole, with_outages = (
+        feed(smoother(of, lag_s=2.0), of, arrivals_of(of)).estimates[-1].bound_95_m for of in (run, cut)
+    )
+    assert with_outages > whole
 
 
 def test_a_mount_that_was_set_as_told_is_not_corrected_twice(tmp_path: Path) -> None:
