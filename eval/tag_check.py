@@ -19,7 +19,7 @@ from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import GnssPosition, TagSighting, world_from_fixes
 from graphloc.recording import Recording
-from graphloc.series import interpolated
+from graphloc.series import interpolated, rms
 from graphloc.solution import Solution
 from graphloc.time import stamps_of
 
@@ -36,6 +36,7 @@ _TURNED_DEG, _STEADY = 6.0, 0.5
 # All tags of a camera elsewhere together.
 _TOGETHER_M = 5.0
 _UPSIDE_DOWN = 0.7  # cosine of the angle between up and down by a tag
+_FITS = 0.5  # of a tag's side, that corners are off at most where one pose explains several: 0.03, and 1.5 to 5 where they hang so
 _UPRIGHT = 3.0  # rise over way of an offset of heights; the rest, without tags, is metres off sideways
 # Share of the sightings of a tag in which the vessel is behind its plane, by more than a fix is off; and by how much more than the
 # camera's lever arm she may be farther from it than it looks: else it is not the facing that is wrong, but the place.
@@ -86,13 +87,19 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
 def _upside_down(sightings: list[TagSighting], config: VesselConfig) -> list[str]:
     """Return a line for each sensor with tags that look upside down: up is below by them, and a vessel hardly heels.
 
-    Those printed from OpenCV hang so. The track tells nothing of that: it may follow the tags.
+    Those printed from OpenCV hang so. The track tells nothing of that: it may follow the tags. Where several of an image agree, it is
+    the camera that is upside down: tags that hang so have each other on the wrong side, and no pose explains them.
     """
     level: dict[Key, list[float]] = defaultdict(list)
+    together: dict[tuple[str, str], list[float]] = defaultdict(list)
     for m in sightings:
-        up_by_mount, up_by_tags = m.R_body_camera[2], m.modes[0].R_world_camera[2]
-        for tag in m.tags:
-            level[m.sensor, tag].append(float(up_by_mount @ up_by_tags))
+        if len(m.tags) > 1 and _misfit(m) < _FITS:
+            together[m.sensor, m.camera].append(_upright_by_tags(m))
+    turned = {camera for camera, own in together.items() if len(own) >= _FEWEST and np.median(own) < -_UPSIDE_DOWN}
+    for m in sightings:
+        if (m.sensor, m.camera) not in turned:
+            for tag in m.tags:
+                level[m.sensor, tag].append(_upright_by_tags(m))
     hanging: dict[str, list[str]] = defaultdict(list)
     for (sensor, tag), own in sorted(level.items()):
         if len(own) >= _FEWEST and np.median(own) < -_UPSIDE_DOWN:
@@ -102,6 +109,19 @@ def _upside_down(sightings: list[TagSighting], config: VesselConfig) -> list[str
         "facing_deg: F is then rpy_deg: [-90, 0, -F]; of a camera, mount.rpy_deg"
         for sensor, tags in hanging.items()
     ]
+
+
+def _upright_by_tags(m: TagSighting) -> float:
+    """Return the cosine of the angle between up by a camera's mount, on a level vessel, and up by its tags."""
+    return float(m.R_body_camera[2] @ m.modes[0].R_world_camera[2])
+
+
+def _misfit(m: TagSighting) -> float:
+    """Return by how much of the first tag's side corners are off where the likeliest pose has them, RMS."""
+    mode = m.modes[0]
+    seen = (m.points_m - mode.p_world_camera_m) @ mode.R_world_camera
+    off = np.linalg.norm(seen[:, :2] / seen[:, 2:] - m.rays, axis=1)
+    return rms(off) / float(np.linalg.norm(m.rays[1] - m.rays[0]))
 
 
 def _seen_from_behind(
@@ -283,10 +303,15 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
         as_seen = [replace(m, R_body_camera=usual.as_matrix()) for m in doubted]
         offs = np.array([_by_tags(m, B) for m, B in zip(as_seen, R, strict=True)]) - p
         moved = np.median(offs, axis=0)
-        if np.linalg.norm(moved) > _TOGETHER_M and np.median(np.abs(offs - moved)) < 0.1 * np.linalg.norm(moved):
-            lines.append(_all_elsewhere(sensor, camera, moved))
-        elif off_deg > _TURNED_DEG and scatter_deg < _STEADY * off_deg:
+        moved_m = float(np.linalg.norm(moved))
+        elsewhere = moved_m > _TOGETHER_M and np.median(np.abs(offs - moved)) < 0.1 * moved_m
+        # No heading that is off rolls or pitches a camera.
+        off_rad = (usual * Rotation.from_matrix(doubted[0].R_body_camera).inv()).as_rotvec()
+        rolled = np.degrees(np.hypot(*off_rad[:2])) > _TURNED_DEG
+        if (rolled or not elsewhere) and off_deg > _TURNED_DEG and scatter_deg < _STEADY * off_deg:
             lines.append(_looks_elsewhere(sensor, camera, off_deg, usual))
+        elif elsewhere:
+            lines.append(_all_elsewhere(sensor, camera, moved))
     return lines
 
 

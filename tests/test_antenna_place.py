@@ -18,11 +18,12 @@ from graphloc.eval.report import Trust, verdict
 from graphloc.eval.report._theses import _gnss_error_m
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import gnss, velocity
-from graphloc.frames import Array
+from graphloc.frames import Array, wrap_angle
 from graphloc.graph import PLACE, Attachment, Decision, Sensor, antenna_off_m, corrections
 from graphloc.linear import factors_of
+from graphloc.measurements import GnssPosition, Measurement
 from graphloc.replay import replay
-from tests.faults import arrivals_of, feed
+from tests.faults import Fed, arrivals_of, feed
 from tests.slowly import with_few_states
 from tests.test_factors import attachment, values_of
 from tests.test_online_faults import smoother
@@ -108,6 +109,13 @@ def test_an_antenna_is_where_a_mount_there_has_it() -> None:
         late = np.array([0.07, 0.0, 0.0, 0.0]) if row is gnss.ROW else np.zeros(3)
         m = row.ideal(displacing(at, value), config)
         np.testing.assert_allclose(row.residuals(m, config, displacing(there, late))[0].raw, 0.0, atol=1e-6)
+
+
+def yaw_errors_deg(run: SimulatedRun, fed: Fed) -> Array:
+    """Errors of each estimate's heading."""
+    R = run.truth.at(np.array(fed.true_ns)).R_world_body
+    yaw = np.array([np.arctan2(e.R_world_body[1, 0], e.R_world_body[0, 0]) for e in fed.estimates])
+    return np.degrees(wrap_angle(yaw - np.arctan2(R[:, 1, 0], R[:, 0, 0])))
 
 
 @pytest.mark.parametrize("mode", [offline, online])
@@ -225,6 +233,25 @@ def test_a_vessel_that_lies_still_is_no_surer_of_its_place_after_restarts(tmp_pa
     assert fed.estimates[-1].bound_95_m > 0.8 * whole.bound_95_m
 
 
+def test_a_vessel_that_lies_still_is_no_surer_of_its_place_after_outages() -> None:
+    """The antenna's place left the window in each, and was told again after it: fewer fixes made the bound smaller."""
+    lying = replace(SCENARIO, path="still", duration_s=40.0, wave_roll_deg=0.2, wave_pitch_deg=0.2, wave_heave_m=0.02)
+    run = displaced(1.0, scenario=lying)
+    begin_ns = int(run.truth.stamps_ns[0])
+
+    def lost(m: Measurement) -> bool:
+        return isinstance(m, GnssPosition) and any(
+            t < (m.stamp_ns - begin_ns) * 1e-9 < t + 5.0 for t in (10, 17, 24, 31)
+        )
+
+    heard = replace(run.recording, measurements=tuple(m for m in run.recording.measurements if not lost(m)))
+    cut = replace(run, recording=heard)
+    whole, with_outages = (
+        feed(smoother(of, lag_s=2.0), of, arrivals_of(of)).estimates[-1].bound_95_m for of in (run, cut)
+    )
+    assert with_outages > whole
+
+
 def test_a_mount_that_was_set_as_told_is_not_corrected_twice(tmp_path: Path) -> None:
     """What a snapshot knows of the antenna's place is of the mount before: resumed with it, the track was 1 m off, 'good', bound 0.3 m."""
     run, path = displaced(1.0), tmp_path / "snapshot.json"
@@ -235,6 +262,20 @@ def test_a_mount_that_was_set_as_told_is_not_corrected_twice(tmp_path: Path) -> 
     resumed = feed(smoother(measured, snapshot=path), measured, came[half:])
     assert any(e.startswith("resumed from a snapshot") for e in resumed.events)
     assert resumed.errors_m[-1] < 0.3
+
+
+def test_a_compass_that_was_set_as_told_is_not_corrected_twice(tmp_path: Path) -> None:
+    """Its offset is a slow state, known from the mount before: resumed with it, the heading was 18 deg off, and 4 deg after 20 s."""
+    right = displaced(0.0, (0.0, 0.0, 0.0))
+    compass = right.config.sensors["compass"]
+    turned = {"mount": compass.mount.model_copy(update={"rpy_deg": (0.0, 0.0, 20.0)}), "mount_offset_sigma_deg": 20.0}
+    wrong = replace(right, config=right.config.with_sensors({"compass": compass.model_copy(update=turned)}))
+    came, path = arrivals_of(right), tmp_path / "snapshot.json"
+    half = len(came) // 2
+    feed(smoother(wrong, snapshot=path), wrong, came[:half])
+    resumed = feed(smoother(right, snapshot=path), right, came[half:])
+    assert any(e.startswith("resumed from a snapshot") for e in resumed.events)
+    assert np.abs(yaw_errors_deg(right, resumed)).max() < 5.0
 
 
 def test_the_report_says_that_online_bounds_are_too_small_before_a_turn() -> None:

@@ -2,6 +2,7 @@
 """The height of a vessel that floats, where the fixes' median stands for it."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -14,7 +15,9 @@ from graphloc.factors.height import slow
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.replay import replay
 from graphloc.trajectory import Trajectory, bounds_95
+from tests.faults import arrivals_of, feed
 from tests.slowly import with_few_states
+from tests.test_online_faults import smoother
 
 UP_M = 4.0  # a slow error of height that lasts longer than the run
 
@@ -56,3 +59,19 @@ def test_a_configured_height_is_off_by_tide_and_load_alone(height_m: float | Non
     process = slow(HeightConfig(height_m=height_m))
     assert process is not None
     assert process.sigma == pytest.approx(sigma_m)
+
+
+def test_a_height_that_has_been_set_since_a_snapshot_counts(tmp_path: Path) -> None:
+    """Not the median in it, by fixes that are 4 m high."""
+    run, path = raised(5.0), tmp_path / "snapshot.json"
+    mean_m = float(run.truth.p_world_m[:, 2].mean())
+    assert run.config.datum is not None
+    block = HeightConfig(height_m=run.config.datum.height_m + mean_m)
+    measured = replace(run, config=run.config.with_sensors({"height": block}))
+    came = arrivals_of(run)
+    half = len(came) // 2
+    before = feed(smoother(run, snapshot=path), run, came[:half]).estimates[-1]
+    assert before.p_world_m[2] - mean_m > 0.5 * UP_M
+    resumed = feed(smoother(measured, snapshot=path), measured, came[half:])
+    assert any(e.startswith("resumed from a snapshot") for e in resumed.events)
+    assert abs(resumed.estimates[-1].p_world_m[2] - mean_m) < 1.0

@@ -274,9 +274,8 @@ def test_a_survey_in_a_grid_is_turned_by_the_convergence_there(tmp_path: Path) -
     along = a * (1.0 - e2) / (1.0 - e2 * np.sin(lat) ** 2) ** 1.5
     east, north = np.radians(0.002) * across * np.cos(np.radians(57.701)), np.radians(0.001) * along
     grid_north_deg = np.degrees(np.arctan(np.tan(np.radians(11.902 - 15.0)) * np.sin(np.radians(57.701))))
-    assert grid_north_deg == pytest.approx(
-        -2.62, abs=0.01
-    )  # meridians lean to the zone's middle, which is east of here
+    # Meridians lean to the zone's middle, which is east of here.
+    assert grid_north_deg == pytest.approx(-2.62, abs=0.01)
     free, turned, riding = survey.tags
     np.testing.assert_allclose(free.xyz_m, (east, north, 3.0), atol=0.02)
     assert free.facing_deg == pytest.approx(180.0 + grid_north_deg, abs=0.01)
@@ -295,6 +294,12 @@ def test_a_survey_in_a_grid_is_turned_by_the_convergence_there(tmp_path: Path) -
         ({"grid": "EPSG:99999"}, "grid EPSG:99999 is not known"),
         ({"grid": "EPSG:4326"}, "does not count metres"),
         ({"grid": "EPSG:2263"}, "does not count metres"),  # feet
+        ({"grid": "EPSG:2048"}, "does not count metres"),  # west and south
+        (
+            {"grid": "EPSG:5845"},
+            "has heights of its own: name that of SWEREF99 TM alone, and give heights above the ellipsoid",
+        ),
+        ({"grid": "EPSG:32632"}, "km from the datum"),  # the next zone
         ({"east": 1e12}, "tag 3: 1e+12, "),
         ({"datum": None}, "needs a `datum:`"),
     ],
@@ -304,3 +309,13 @@ def test_a_survey_in_a_grid_that_is_none_is_one_line(changes: dict[str, object],
         in_grid(tmp_path, **changes)  # type: ignore[arg-type]
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("grid", "told"), [("EPSG:26910", True), ("EPSG:32610", False)], ids=["NAD 83", "WGS 84"])
+def test_a_grid_whose_place_on_earth_is_known_to_metres_only_is_said(
+    grid: str, caplog: pytest.LogCaptureFixture, *, told: bool, tmp_path: Path
+) -> None:
+    datum = {"latitude_deg": 37.8, "longitude_deg": -122.4, "height_m": 0.0}
+    east, north = Transformer.from_crs(4326, 32610, always_xy=True).transform(-122.4, 37.8)
+    in_grid(tmp_path, datum, grid=grid, east=east, north=north)
+    assert ("is tied to WGS 84 to" in caplog.text) is told

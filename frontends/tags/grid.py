@@ -3,15 +3,22 @@
 
 from __future__ import annotations
 
+import logging
+import warnings
+
 import numpy as np
 from pyproj import CRS
 from pyproj.exceptions import ProjError
-from pyproj.transformer import AreaOfInterest, Transformer
+from pyproj.transformer import AreaOfInterest, TransformerGroup
 
 from graphloc.frames import Array, Datum
 from graphloc.survey import WORLD, Survey
 
 _AHEAD_M = 10.0  # over which the direction of grid north is taken
+_FAR_M = 50e3  # from the datum: another zone, or northing and easting swapped
+_LOOSE_M = 1.5  # a tie to WGS 84 that is less sure than that is worth a word; those of ETRS 89 say 1 m
+
+log = logging.getLogger(__name__)
 
 
 def in_world(survey: Survey, datum: Datum) -> Survey:
@@ -21,7 +28,8 @@ def in_world(survey: Survey, datum: Datum) -> Survey:
     that of grid north there. Places and directions on a dock are the dock's, as before.
 
     Raises:
-        ValueError: the grid is unknown or does not count metres, or a place is not in it.
+        ValueError: the grid is unknown, does not count metres east and north, or has heights of its own; or a place is not in it, or
+            is farther than 50 km from the datum.
     """
     if not survey.grid:
         return survey
@@ -54,11 +62,22 @@ class _Grid:
         here = AreaOfInterest(longitude, datum.origin.latitude_deg, longitude, datum.origin.latitude_deg)
         try:
             crs = CRS.from_user_input(name)
-            self._to_geodetic = Transformer.from_crs(crs, 4326, always_xy=True, area_of_interest=here)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # that a better tie needs a file: said below
+                ties = TransformerGroup(crs, 4326, always_xy=True, area_of_interest=here).transformers
         except ProjError:
             raise ValueError(f"grid {name} is not known") from None
-        if not crs.is_projected or any(axis.unit_name != "metre" for axis in crs.axis_info[:2]):
+        axes = {(axis.direction, axis.unit_name) for axis in crs.axis_info[:2]}
+        if not ties or not crs.is_projected or axes != {("east", "metre"), ("north", "metre")}:
             raise ValueError(f"grid {name} ({crs.name}) does not count metres east and north")
+        if crs.is_compound:  # its heights are above the sea
+            flat = crs.sub_crs_list[0].name
+            raise ValueError(
+                f"grid {name} ({crs.name}) has heights of its own: name that of {flat} alone, and give heights above the ellipsoid"
+            )
+        self._to_geodetic = ties[0]
+        if self._to_geodetic.accuracy > _LOOSE_M:
+            log.warning("grid %s (%s) is tied to WGS 84 to %g m only", name, crs.name, self._to_geodetic.accuracy)
         self._name, self._datum = name, datum
 
     def placed(self, what: str, xyz_m: tuple[float, float, float]) -> tuple[tuple[float, float, float], float]:
@@ -67,6 +86,11 @@ class _Grid:
         here, ahead = self._world(np.array([[east, north, height], [east, north + _AHEAD_M, height]]))
         if not np.isfinite([here, ahead]).all():
             raise ValueError(f"{what}: {east:g}, {north:g} is not in the grid {self._name}")
+        if (away_m := float(np.linalg.norm(here))) > _FAR_M:
+            raise ValueError(
+                f"{what}: {east:.0f} east, {north:.0f} north in {self._name} is {away_m / 1000.0:.0f} km from the datum: swapped, or "
+                "another grid or datum"
+            )
         x, y, z = here.tolist()
         way = ahead - here
         return (x, y, z), float(np.degrees(np.arctan2(way[0], way[1])))

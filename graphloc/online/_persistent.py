@@ -70,7 +70,11 @@ class PersistentState:
                     if name in sensors
                 }
             ),
-            heights_m={name: height_m for name, height_m in found.heights_m.items() if name in sensors},
+            heights_m={
+                name: height_m if (now_m := sensors[name].height_m) is None else now_m - found.datum.origin.height_m
+                for name, height_m in found.heights_m.items()
+                if name in sensors
+            },
             heading=found.heading,
             agreed_ns=dict(found.agreed_ns),
             odometry=Odometry(found.anchor.stamp_ns, found.p_odom_m, found.R_odom_body),

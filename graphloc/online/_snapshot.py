@@ -36,7 +36,7 @@ class Snapshot:
             and on that of the accelerometer. sensor_noise: those of other sensors' sigmas (`SensorNoise.times`).
         heading: where no sensor measures it, how far it may be off.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
-        settings: by sensor, what the constants in the anchor are added to (`settings_of`).
+        settings: by sensor, what slow states and constants in the anchor are added to (`settings_of`).
         unmodelled: sizes of `UnmodelledError`; None where no slow error is left out, and the IMU's mount is right.
     """
 
@@ -55,10 +55,14 @@ class Snapshot:
     unmodelled: ErrorSizes | None
 
     def anchor_for(self, config: VesselConfig) -> Anchor:
-        """Return the anchor without the constants of sensors that are set otherwise now: corrected as told, they would be corrected twice."""
+        """Return the anchor without what is known of sensors that are set otherwise now: corrected as told, they would be corrected twice."""
         now = settings_of(config)
-        kept = {of: known for of, known in self.anchor.constants.items() if self.settings[of[0]] == now.get(of[0])}
-        return replace(self.anchor, constants=kept)
+        same = {name for name, were in self.settings.items() if were == now.get(name)}
+        return replace(
+            self.anchor,
+            slow={name: known for name, known in self.anchor.slow.items() if name in same},
+            constants={of: known for of, known in self.anchor.constants.items() if of[0] in same},
+        )
 
     def write(self, path: Path) -> None:
         """Replace the file atomically: a kill leaves the old one or the new one.
@@ -140,8 +144,8 @@ class Snapshot:
 
 
 def settings_of(config: VesselConfig) -> dict[str, Any]:
-    """Return by sensor, as plain data, where it is taken to sit and by how much its stamps are taken to be off."""
-    said = {"mount", "time_offset_s"}
+    """Return by sensor, as plain data, what its slow state and constants are added to: mounts, time offset, survey, height."""
+    said = {"mount", "cameras", "lidars", "time_offset_s", "survey", "height_m"}
     return {name: sensor.model_dump(mode="json", include=said) for name, sensor in config.sensors.items()}
 
 
