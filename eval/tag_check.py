@@ -7,7 +7,7 @@ It finds tags at another position, those that face another way, wrong sizes, and
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import combinations
 
@@ -100,15 +100,20 @@ def _upside_down(sightings: list[TagSighting], config: VesselConfig) -> list[str
         if (m.sensor, m.camera) not in turned:
             for tag in m.tags:
                 level[m.sensor, tag].append(_upright_by_tags(m))
-    hanging: dict[str, list[str]] = defaultdict(list)
-    for (sensor, tag), own in sorted(level.items()):
-        if len(own) >= _FEWEST and np.median(own) < -_UPSIDE_DOWN:
-            hanging[sensor].append(config.of_kind("apriltag")[sensor].surveyed.called(*tag))
+    hanging = [key for key, own in level.items() if len(own) >= _FEWEST and np.median(own) < -_UPSIDE_DOWN]
     return [
         f"{sensor}: {', '.join(tags)}: upside down, unless the camera is: tags printed from OpenCV hang so, and what would be "
         "facing_deg: F is then rpy_deg: [-90, 0, -F]; of a camera, mount.rpy_deg"
-        for sensor, tags in hanging.items()
+        for sensor, tags in _called(hanging, config).items()
     ]
+
+
+def _called(found: Iterable[Key], config: VesselConfig) -> dict[str, list[str]]:
+    """Return what the survey of each sensor calls its tags among these."""
+    called: dict[str, list[str]] = defaultdict(list)
+    for sensor, tag in sorted(found):
+        called[sensor].append(config.of_kind("apriltag")[sensor].surveyed.called(*tag))
+    return called
 
 
 def _upright_by_tags(m: TagSighting) -> float:
@@ -145,14 +150,11 @@ def _seen_from_behind(
             away_m, looks_m = float(np.linalg.norm(away)), float(np.linalg.norm(_in_camera(m)))
             as_far = abs(away_m - looks_m) < float(np.linalg.norm(m.t_body_camera_m)) + _PLACE_M
             seen[m.sensor, tag].append((away_m, looks_m, as_far and before_m < -_BEHIND_M))
-    behind: dict[str, list[str]] = defaultdict(list)
-    for (sensor, tag), own in sorted(seen.items()):
-        if len(own) >= _FEWEST and _faces_away(np.array(own)):
-            behind[sensor].append(config.of_kind("apriltag")[sensor].surveyed.called(*tag))
+    behind = [key for key, own in seen.items() if len(own) >= _FEWEST and _faces_away(np.array(own))]
     return [
         f"{sensor}: {', '.join(tags)}: by the fixes they are seen from behind, where no print is: facing_deg (or rpy_deg) is the "
         "other way round"
-        for sensor, tags in behind.items()
+        for sensor, tags in _called(behind, config).items()
     ]
 
 

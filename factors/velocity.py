@@ -4,9 +4,10 @@
     z = v + dv + R (omega x (l + o)) + w,   w ~ N(0, C)
 
 v: velocity of body in world at the state; dv: its change until the measurement, by the IMU; omega: body rate from the gyroscope,
-bias removed; l: antenna in body; o: how far from there it sits, a constant of the run, where that is not known. d z / d v = I, d z / d theta = -R [omega x (l + o)]_x. The lever-arm term carries information: in
-waves it shows the heading. With R fixed at the estimate in it, passes converged slowly (not after 6). dv and omega are taken
-from the estimate at every pass; dv within half a period of the states turns by 9 mm/s for 1 deg of attitude.
+bias removed; l: antenna in body; o: how far from there it sits, a constant of the run, where that is not known. d z / d v = I,
+d z / d theta = -R [omega x (l + o)]_x. The lever-arm term carries information: in waves it shows the heading. With R fixed at the
+estimate in it, passes converged slowly (not after 6). dv and omega are taken from the estimate at every pass; dv within half a period
+of the states turns by 9 mm/s for 1 deg of attitude.
 """
 
 from __future__ import annotations

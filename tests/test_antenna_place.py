@@ -13,7 +13,7 @@ import pytest
 from graphloc import app
 from graphloc.config import GnssConfig, VelocityConfig
 from graphloc.eval.holdout import HoldOut
-from graphloc.eval.metrics import Antennas, TruthMetrics, compare_to_held_out, compare_to_truth
+from graphloc.eval.metrics import Antennas, TruthMetrics, compare_to_held_out
 from graphloc.eval.report import Trust, verdict
 from graphloc.eval.report._theses import _gnss_error_m
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
@@ -26,11 +26,9 @@ from graphloc.replay import replay
 from tests.faults import Fed, arrivals_of, feed
 from tests.slowly import with_few_states
 from tests.test_factors import attachment, values_of
+from tests.test_late_fixes import SCENARIO, offline, online, solved
 from tests.test_online_faults import smoother
 
-SCENARIO = Scenario(
-    path="loops", duration_s=40.0, noise="clean", pose_hz=0.0, gnss_hz=2.5, gnss_sigma_m=0.02, imu_hz=50.0
-)
 GNSS = GnssConfig(kind="gnss", mount_sigma_m=1.0, stamp_sigma_s=0.1)
 OFF_M = np.array([0.7, -0.4, 0.3])
 
@@ -51,19 +49,6 @@ def displaced(
     }
     config = run.config.with_sensors({"gnss": block.model_copy(update=settings)})
     return replace(run, config=with_few_states(config, 2.5))
-
-
-@cache
-def solved(run: SimulatedRun) -> app.Run:
-    return app.simulated(run)
-
-
-def offline(run: SimulatedRun) -> TruthMetrics:
-    return compare_to_truth(solved(run).solution.trajectory, run.truth)
-
-
-def online(run: SimulatedRun) -> TruthMetrics:
-    return compare_to_truth(replay(run.recording, run.config).solution.trajectory, run.truth)
 
 
 def displacing(at: Attachment, value: Array) -> Attachment:
