@@ -3,7 +3,8 @@
 
 The stated sigma does not show them: a wrong RTK fix is stated to a centimetre as a right one is. They are found in the
 positions themselves, by comparing each step with those before and after it: no vessel changes its acceleration by so much
-at once.
+at once. Offline those are found, too, that stand out less, or whose fixes are far apart: the IMU keeps a track from following at
+once, so the fixes are off to one side of it before a jump, and to the other one after it.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ _SIGMAS, _BRAKES_MPS2 = 10.0, 10.0  # stated sigmas; emergency braking of a car 
 _EVEN = 1.5  # steps in time that differ by more than this factor are not compared
 _IN_BOUNDS = 1.5  # sigmas of the slow error that the bounds include: jumps up to there need no word
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
+# Off a track: fixes on either side of a jump are compared for so long, and at least so many; by how many sigmas of that they differ, and by
+# how much at least; what share of it comes from one fix to the next, as where track and fixes part otherwise they do so little by little.
+_BESIDE_S, _FEWEST_BESIDE, _OFF_SIGMAS, _OFF_M, _AT_ONCE = 2.0, 3, 8.0, 1.0, 0.5
+_GAP = 3.0  # times the usual time between fixes
 _KEPT = 200
 _FITS_SIGMAS, _CERTAIN_SIGMAS = 5.0, 8.0  # off a prediction
 _SAME, _SAME_SIGMAS = 0.25, 3.0  # off a prediction by the same: within this share and so many sigmas
@@ -85,6 +90,38 @@ def position_jumps(
     back = np.linalg.norm(parts[far][:, None] + parts[far][None], axis=2) < off_m[far] / 2.0
     far = far[~(near & back).any(axis=1)]
     return stamps_ns[far + 2], off_m[far]
+
+
+def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: float) -> tuple[NDArray[np.int64], Array]:
+    """Return stamps (K,) and sizes (K,), m, of the position jumps that an estimated track does not follow at once.
+
+    The medians of some fixes before and after are compared, so that outliers do not count.
+
+    Args:
+        stamps_ns: (N,), increasing. off_m: (N, 2) fixes less the track.
+        allowed_m: jumps that the bounds already include (`allowed_jump_m`).
+    """
+    dt_s = np.diff(stamps_ns) / NS_PER_S
+    usual_s = float(np.median(dt_s)) if len(dt_s) else np.inf
+    n = max(_FEWEST_BESIDE, round(_BESIDE_S / max(usual_s, 1e-3)))
+    if len(off_m) < max(2 * n, _FEWEST):
+        return np.zeros(0, dtype=np.int64), np.zeros(0)
+    steps = np.diff(off_m, axis=0)
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(off_m, n, axis=0), axis=-1)
+    change = medians[n:] - medians[:-n]  # about each step that has n fixes on either side
+    size_m, inner = np.linalg.norm(change, axis=1), slice(n - 1, n - 1 + len(change))
+    # Standard deviations on one axis: of a fix, by the steps' median length; of a difference of medians.
+    sigma_m = float(np.median(np.linalg.norm(steps, axis=1))) / np.sqrt(4.0 * np.log(2.0))
+    least_m = max(_OFF_M, allowed_m, _OFF_SIGMAS * sigma_m * np.sqrt(np.pi / n))
+    along_m = np.einsum("ni,ni->n", steps[inner], change) / np.maximum(size_m, 1e-9)
+    # Over a gap the track bends, too, where the IMU is worse than it is taken for.
+    jumps = (size_m > least_m) & (along_m > _AT_ONCE * size_m) & (dt_s[inner] < _GAP * usual_s)
+    left_m, found = np.where(jumps, size_m, 0.0), list[int]()
+    while left_m.max() > 0.0:
+        found.append(int(np.argmax(left_m)))
+        left_m[max(found[-1] - n + 1, 0) : found[-1] + n] = 0.0
+    at = np.sort(np.array(found, dtype=np.int64))
+    return stamps_ns[at + n], size_m[at]
 
 
 def allowed_jump_m(left_out: SlowProcess | None) -> float:

@@ -20,7 +20,14 @@ from graphloc.graph import Residual
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement
 from graphloc.online import OnlineSmoother
 from graphloc.online import _start as online_start
-from graphloc.position_jumps import JumpDetector, OffPrediction, PositionJump, jump_warnings, position_jumps
+from graphloc.position_jumps import (
+    JumpDetector,
+    OffPrediction,
+    PositionJump,
+    jump_warnings,
+    jumps_off_track,
+    position_jumps,
+)
 from graphloc.recording import Recording
 from graphloc.replay import arrivals, replay
 from graphloc.solution import Health, Solution
@@ -484,6 +491,48 @@ def test_a_jump_of_the_only_receiver_is_not_followed_where_the_imu_contradicts_i
     assert off.coverage_95 > 0.95
     assert off.position_max_m < 3.0
     assert any("position jump of 12 m" in w and "treated as its error" in w for w in found.stats.warnings)
+
+
+@pytest.mark.parametrize(("gnss_hz", "noise_m"), [(5.0, 0.7), (1.0, 0.4)])
+def test_a_jump_between_noisy_fixes_is_seen_where_the_track_leaves_them(gnss_hz: float, noise_m: float) -> None:
+    """10 m for 20 s, and no step that stands out among the others: it was followed, and outside the bounds for half of the run."""
+    run, recording, config = jumping_alone(gnss_hz, (20.0, 40.0), 60.0, off_m=10.0, sigma_m=noise_m)
+    rng = np.random.default_rng(4)
+
+    def shaken(m: Measurement) -> Measurement:
+        if not isinstance(m, GnssPosition):
+            return m
+        north, east = rng.normal(0.0, noise_m, 2) / 111_300.0
+        lat, lon, height = m.position
+        return replace(m, position=Geodetic(lat + north, lon + east / np.cos(np.radians(lat)), height))
+
+    found = app.smooth_recording(recording.changed(shaken), config).solution
+    off = compare_to_truth(found.trajectory, run.truth)
+    assert off.coverage_95 is not None
+    assert off.coverage_95 > 0.95
+    assert off.position_max_m < 3.0
+    assert any("and 1 more: treated as its error" in w for w in found.stats.warnings)
+
+
+@pytest.mark.parametrize("hz", [0.5, 1.0, 5.0, 20.0])
+def test_what_a_track_leaves_of_its_fixes_shows_jumps_and_neither_outliers_nor_bends(hz: float) -> None:
+    t = np.arange(0.0, 120.0, 1.0 / hz)
+    stamps_ns, noise = np.round(t * 1e9).astype(np.int64), np.random.default_rng(3).normal(0.0, 0.3, (len(t), 2))
+
+    def seen(more: Array | float = 0.0, heard: NDArray[np.bool_] | slice = slice(None)) -> list[tuple[float, float]]:
+        off_m = noise + np.outer(np.ones(len(t)) * more, [0.6, -0.8])
+        found = jumps_off_track(stamps_ns[heard], off_m[heard], allowed_m=3.0)
+        return [(float(n) * 1e-9, float(m)) for n, m in zip(*found, strict=True)]
+
+    bent = 3.0 * np.tanh((t - 60.0) / 4.0)
+    assert seen() == seen(bent) == []
+    assert seen(20.0 * (np.arange(len(t)) % 7 == 3)) == []
+    # The track follows within seconds, and is off by half of the jump on either side.
+    jump = np.where(t < 60.0, -1.0, 1.0) * 4.0 * np.exp(-np.abs(t - 60.0) / 8.0)
+    ((at_s, size_m),) = seen(jump)
+    assert at_s == pytest.approx(60.0)
+    assert 4.0 < size_m < 9.0
+    assert seen(jump, (t < 59.0 - 5.0 / hz) | (t >= 60.0)) == []  # over a gap anything may have moved
 
 
 @pytest.mark.parametrize("off_m", [10.0, 40.0])

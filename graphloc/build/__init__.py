@@ -35,7 +35,7 @@ from graphloc.build._graph import (
     cost_of_constants,
     state_keys,
 )
-from graphloc.build._layout import company_of, make_problem, mount_of, slow_or_left_out
+from graphloc.build._layout import company_of, jumping, make_problem, mount_of, slow_or_left_out
 from graphloc.build._problem import (
     Problem,
     Stream,
@@ -75,6 +75,7 @@ __all__ = [
     "company_of",
     "constant_keys",
     "cost_of_constants",
+    "jumping",
     "make_problem",
     "mount_of",
     "nav_state",

@@ -151,6 +151,16 @@ def _slow_and_jumps(
     return slow, left_out, jumps
 
 
+def jumping(stream: Stream, stamps_ns: NDArray[np.int64], sizes_m: Array) -> Stream:
+    """Return it with more position jumps (K,), ns and m."""
+    known_ns, known_m = stream.position_jumps
+    at = np.searchsorted(known_ns, stamps_ns)
+    jumps = np.insert(known_ns, at, stamps_ns), np.insert(known_m, at, sizes_m)
+    if stream.left_out is None:
+        return replace(stream, position_jumps=jumps)
+    return replace(stream, position_jumps=jumps, slow=without_drift(stream.left_out), left_out=None)
+
+
 def _position_jumps(row: Sensor, measurements: Sequence[Measurement], datum: Datum, allowed_m: float) -> PositionJumps:
     """Return stamps and sizes of the position jumps of the only sensor that measures position."""
     hints = [(m.stamp_ns, row.hint(m, 0.0, datum)) for m in measurements]

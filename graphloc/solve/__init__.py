@@ -64,7 +64,7 @@ def smooth(
             except ImuWrong as wrong:
                 part, why = left_out(part, wrong.spans)
                 said.append(why)
-        solution = make_solution(problem, part, result)
+        solution = make_solution(result.stated, part, result)
         solution = replace(solution, stats=replace(solution.stats, warnings=(*said, *solution.stats.warnings)))
         if probe is None:
             return solution

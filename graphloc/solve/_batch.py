@@ -6,8 +6,9 @@
    new in a window are judged by the prediction without them, with its covariance (`_grow`). Both on a
    thinned run (`graphloc.build.thinned`). Passes over all of it remove the seams: there they cost a fifth.
 3. Passes over the whole run: modes and weights re-chosen until they no longer change (`_passes`).
-4. Try other choices that may be more probable (`_choices`), and repeat 3 where there are any. Where the IMU's mount is clearly off,
-   repeat 3 with it turned (`_imu_mount`).
+4. Try other choices that may be more probable (`_choices`), and repeat 3 where there are any. Where that shows position
+   jumps of the only position sensor, 1 to 4 are repeated with them (`_jumps`). Where the IMU's mount is clearly off, repeat 3 with it
+   turned (`_imu_mount`).
 5. Where receivers jump and no other sensor measures position, choose the most probable level (`_levels`).
 6. A Bayes tree of the last graph gives the covariances of every state.
 
@@ -48,6 +49,7 @@ from graphloc.solve._decide import AGREES, Stage, Verdicts, agrees, met, weigh
 from graphloc.solve._grow import grow
 from graphloc.solve._imu_mount import MountError, with_mount_estimated
 from graphloc.solve._imu_noise import with_needed_noise
+from graphloc.solve._jumps import with_jumps_off_track
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import (
@@ -61,7 +63,7 @@ from graphloc.solve._passes import (
 from graphloc.solve._sensor_noise import scattering
 from graphloc.solve._start import Begun, solve_start
 
-_MAX_NOISE_ROUNDS, _MAX_SENSOR_ROUNDS = 4, 2
+_MAX_NOISE_ROUNDS, _MAX_SENSOR_ROUNDS, _MAX_JUMP_ROUNDS = 4, 2, 2
 # Before other choices are tried, passes need not converge: what still changes then is a choice that confirms itself.
 _FIRST_PASSES, _LAST_PASSES = 6, 15
 # At most: over the thinned run after growing; with each gentle loss, where the IMU's noise has changed.
@@ -78,9 +80,10 @@ _CLEARLY = 10.0  # log-likelihood by which a solution must be more probable
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchResult:
-    """The solved graph, before it is turned into a `Solution`; `problem` has the IMU noise that it was solved with."""
+    """The solved graph, before it is turned into a `Solution`; `problem` has the noise that it was solved with, `stated` that as configured."""
 
     problem: Problem
+    stated: Problem
     values: gtsam.Values
     verdicts: Verdicts
     tree: Any
@@ -125,6 +128,13 @@ def solve_batch(
         SolveError: it could not be started, or the linear algebra failed.
     """
     begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu)
+    for _ in range(0 if newest else _MAX_JUMP_ROUNDS):
+        if (jumping := with_jumps_off_track(problem, solved.settled.verdicts)) is None:
+            break
+        problem = jumping
+        del solved
+        begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu)
+    stated = problem
     mount = None
     if not newest:
         solved, prior, mount = solved.with_mount_estimated(begun.prior, progress)
@@ -144,7 +154,8 @@ def solve_batch(
             break
         if begun.start.by_motion and ratio < CONTRADICTION:
             # Which headings the motion excludes was found with the smaller noise.
-            return solve_batch(replace(noisier, usual_motion=None), progress, newest=newest)
+            again = solve_batch(replace(noisier, usual_motion=None), progress, newest=newest)
+            return replace(again, stated=stated)
         problem = bridged(noisier, estimate)
         if ratio >= CONTRADICTION:
             estimate, used, passed = rough_passes(
@@ -166,6 +177,7 @@ def solve_batch(
     passes, iterations = passes + passed, iterations + used
     return BatchResult(
         problem=problem,
+        stated=stated,
         values=settled.values,
         verdicts=settled.verdicts,
         tree=bayes_tree(settled.graph, settled.values),

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build import Problem, StartPrior, Stream, build_graph, standing_cost
+from graphloc.build import Problem, StartPrior, Stream, build_graph, jumping, standing_cost
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
@@ -158,8 +158,8 @@ def _after_outage(
     """
     best, costs, places, passes, iterations = case, [_total(case, prior)], [case.places()], 0, 0
     for level in case.levels(span.from_ns, span.until_ns)[:_MOST_LEVELS]:
-        size_m, back_ns = float(np.linalg.norm(level)), span.gap_ns[1]
-        streams = (_jumping(s, back_ns, size_m) if s in case.streams else s for s in case.problem.streams)
+        back = np.array([span.gap_ns[1]]), np.array([np.linalg.norm(level)])
+        streams = (jumping(s, *back) if s in case.streams else s for s in case.problem.streams)
         problem = replace(case.problem, streams=tuple(streams))
         moved = _moved(case, -level, span.gap_ns)
         verdicts = weigh(problem, moved, first=0, last=len(problem.timeline) - 1, stage=Stage.FINAL)
@@ -183,13 +183,6 @@ def _total(case: _Case, prior: StartPrior) -> float:
     last = len(case.problem.timeline) - 1
     cost = cost_as_configured(case.problem, case.settled.values, 0, last, prior, judged=last)
     return cost + case.cost(_away_cost, np.zeros(3))
-
-
-def _jumping(stream: Stream, at_ns: int, size_m: float) -> Stream:
-    """Return it with one more position jump."""
-    stamps_ns, sizes_m = stream.position_jumps
-    n = int(np.searchsorted(stamps_ns, at_ns))
-    return replace(stream, position_jumps=(np.insert(stamps_ns, n, at_ns), np.insert(sizes_m, n, size_m)))
 
 
 def _told_otherwise(problem: Problem, verdicts: Verdicts) -> bool:
