@@ -15,20 +15,23 @@ from graphloc.measurements import GnssPosition, Measurement
 from graphloc.online import OnlineSmoother, _waiting
 from graphloc.online._unmodelled import UnmodelledError
 from graphloc.recording import Recording
+from graphloc.series import rms
 from graphloc.solution import Solution
 from graphloc.solve import _solution
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._unmodelled import Unmodelled, unmodelled
+from graphloc.trajectory import Trajectory
 from tests.faults import arrivals_of, feed, finish
 from tests.slowly import with_few_states
 
 CORRELATED_S = 200.0  # of the default configuration
 
 
-def drifting(seed: int, sigma_m: float) -> tuple[SimulatedRun, Recording, VesselConfig]:
-    """A run of IMU and one receiver, and its recording and configuration where the fixes drift as that states."""
+def drifting(seed: int, sigma_m: float, compass_hz: float = 0.0) -> tuple[SimulatedRun, Recording, VesselConfig]:
+    """A run of IMU, one receiver and a compass, if any, and its recording and configuration where the fixes drift as that states."""
     scenario = Scenario(
-        path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, compass_hz=0.0, imu_hz=50.0, gnss_hz=2.0, gnss_sigma_m=0.05
+        path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, compass_hz=compass_hz, imu_hz=50.0, gnss_hz=2.0,
+        gnss_sigma_m=0.05,
     )  # fmt: skip
     run = simulate(scenario, seed)
     rng, off_m, last_ns = np.random.default_rng(seed), np.zeros(2), None
@@ -46,7 +49,8 @@ def drifting(seed: int, sigma_m: float) -> tuple[SimulatedRun, Recording, Vessel
     gnss = run.config.sensors["gnss"]
     assert isinstance(gnss, GnssConfig)
     slow_error = gnss.slow_error.model_copy(update={"horizontal_sigma_m": sigma_m})
-    sensors = {"imu": run.config.sensors["imu"], "gnss": gnss.model_copy(update={"slow_error": slow_error})}
+    sensors = {name: run.config.sensors[name] for name in ("imu", "gnss", "compass") if compass_hz or name != "compass"}
+    sensors["gnss"] = gnss.model_copy(update={"slow_error": slow_error})
     return run, replace(run.recording, measurements=tuple(moved)), run.config.model_copy(update={"sensors": sensors})
 
 
@@ -73,6 +77,31 @@ def test_a_drifting_receiver_is_in_the_bounds_of_heading_and_velocity() -> None:
     heading, velocity = np.mean([h.mean() for h, _ in found]), np.mean([v.mean() for _, v in found])
     assert 0.3 < heading < 2.2  # of some four degrees of freedom
     assert 0.6 < velocity < 1.2
+
+
+def test_a_drift_does_not_turn_the_heading_against_the_compass(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As good as with the drift as a state, which the antenna's place does not have: it follows the fixes."""
+    run, recording, config = drifting(1, 2.0, compass_hz=5.0)
+    config = with_few_states(config, 2.0)
+    gnss = config.sensors["gnss"]
+    slow_error = gnss.slow_error.model_copy(update={"enabled": True, "jumps": False})
+    full = config.with_sensors({"gnss": gnss.model_copy(update={"slow_error": slow_error})})
+    lever_m = gnss.mount.t_body_sensor_m
+
+    def solved(config: VesselConfig) -> Trajectory:
+        return app.smooth_recording(recording, config).solution.trajectory
+
+    def off_deg(track: Trajectory) -> Array:
+        return np.degrees(wrap_angle(track.yaw_rad - run.truth.at(track.stamps_ns).yaw_rad))
+
+    taken_back, as_state = solved(config), solved(full)
+    monkeypatch.setattr(_solution, "with_drift_taken_back", lambda result: result)
+    followed = solved(config)
+    inside = slice(10, -10)  # the truth begins and ends with the run
+    assert rms(off_deg(followed)[inside]) > 2.0 * rms(off_deg(taken_back)[inside])
+    assert np.abs(off_deg(taken_back) - off_deg(as_state))[inside].max() < 0.2
+    antenna = [track.p_world_m + track.R_world_body @ lever_m for track in (taken_back, followed)]
+    assert np.abs(antenna[0] - antenna[1]).max() < 1e-6
 
 
 def test_online_too(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,6 +28,7 @@ from graphloc.solve._covariances import (
     world_covariance,
 )
 from graphloc.solve._doubt import widen_by_doubt
+from graphloc.solve._drift import with_drift_taken_back
 from graphloc.solve._health import health_over_time, misfits, since_agreed
 from graphloc.solve._imu_mount import mount_error
 from graphloc.solve._ledger import ledger_of
@@ -42,7 +43,8 @@ _TOLD_RAD = np.radians(7.0)  # 1 sigma of a heading of which those 30 deg beside
 
 def make_solution(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
     """Return what the solver hands over."""
-    n = len(problem.timeline)
+    n, known = len(problem.timeline), result
+    result, unsaid = _without_drift(known)
     values, tree, slow_of = result.values, result.tree, problem.timeline.slow_of
     poses = [values.atPose3(keys.pose(k)) for k in range(n)]
     R = np.array([p.rotation().matrix() for p in poses])
@@ -63,12 +65,12 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     assert trajectory.cov is not None
     trajectory.cov[:, :3, :3] += unmodelled_covariance(problem.streams) + result.levels_cov
     v_cov = np.array([tree.marginalCovariance(keys.velocity(k)) for k in range(n)])
-    guess = _add_others(result, trajectory.cov)
-    unsaid = [
-        *_add_unmodelled(result, trajectory.cov, v_cov),
-        *_add_mount(result, R, trajectory.cov, v_cov),
-        *(guess or _add_guess(result, trajectory.cov)),
-        *_add_doubt(result, trajectory.cov),
+    guess = _add_others(known, trajectory.cov)
+    unsaid += [
+        *_add_unmodelled(known, trajectory.cov, v_cov),
+        *_add_mount(known, R, trajectory.cov, v_cov),
+        *(guess or _add_guess(known, trajectory.cov)),
+        *_add_doubt(known, trajectory.cov),
     ]
     limit_heading(trajectory.cov)
     since = {s.name: since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
@@ -104,6 +106,16 @@ def _add_doubt(result: BatchResult, cov: Array) -> list[str]:
         return widen_by_doubt(result, cov)
     except (SolveError, RuntimeError, np.linalg.LinAlgError, MemoryError) as error:
         return [f"the bounds do not include that believed poses may be false together ({in_one_line(error)})"]
+
+
+def _without_drift(result: BatchResult) -> tuple[BatchResult, list[str]]:
+    """Take back what a drift that is left out did to heading and velocity; return a warning, too, where that fails."""
+    try:
+        return with_drift_taken_back(result), []
+    except (RuntimeError, MemoryError) as error:
+        return result, [
+            f"heading and velocity follow the slow GNSS error: its effect is not determined ({in_one_line(error)})"
+        ]
 
 
 def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:

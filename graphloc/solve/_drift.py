@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the drift of the only position sensor did to heading and velocity, taken back.
+
+Its slow error is left out of the graph (`Stream.left_out`), so fixes count as if their errors were white: hundreds of them a minute
+overrule a compass by six of its sigmas, where the drift that bends their track is the likelier reason. With the error as states
+the linearised run weighs them as configured. Its heading, velocity and slow states of the other sensors are taken over. The antenna stays
+where the fixes have it, as nothing tells which part of their error is which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from scipy.sparse import diags_array
+
+from graphloc import keys
+from graphloc.build import Problem
+from graphloc.frames import Array
+from graphloc.solve._batch import BatchResult
+from graphloc.solve._linearised import linearised, normal_solver, root_weights, with_left_out
+
+_LINEAR_RAD = np.radians(15.0)  # a turn up to which the linearised run holds
+
+
+def with_drift_taken_back(result: BatchResult) -> BatchResult:
+    """Return the result with heading, velocity and slow states as they are where the left-out slow error is a state; covariances as they are.
+
+    Nothing changes where no error is left out, or where the heading would turn by more than the linearised run can tell.
+
+    Raises:
+        RuntimeError: a state is not determined.
+    """
+    problem, values = result.problem, result.values
+    followed = next((stream for stream in problem.streams if stream.left_out is not None), None)
+    if followed is None:
+        return result
+    full, there = with_left_out(problem, values)
+    rows = linearised(full, there, result.verdicts, result.prior)
+    root = root_weights(rows, -rows.b)
+    J = diags_array(root) @ rows.J
+    dx = normal_solver(J)(J.T @ (root * rows.b))
+    if not np.isfinite(dx).all():
+        raise RuntimeError("not finite")
+    turned = dx[rows.first_pose :].reshape(-1, 6)[:, :3]
+    if np.linalg.norm(turned, axis=1).max() > _LINEAR_RAD:
+        return result
+    faster = dx[rows.first_velocity : rows.first_pose].reshape(-1, 3)
+    moved, antenna = gtsam.Values(values), followed.mount.translation()
+    for k, (turn, dv) in enumerate(zip(turned, faster, strict=True)):
+        pose = values.atPose3(keys.pose(k))
+        R = pose.rotation().compose(gtsam.Rot3.Expmap(turn))
+        moved.update(keys.pose(k), gtsam.Pose3(R, pose.transformFrom(antenna) - R.rotate(antenna)))
+        moved.update(keys.velocity(k), values.atVector(keys.velocity(k)) + dv)
+    for key, change in _slow_states(full, dx[: rows.first_velocity]):
+        if values.exists(key):
+            moved.update(key, values.atVector(key) + change)
+    return replace(result, values=moved)
+
+
+def _slow_states(problem: Problem, dx: Array) -> Iterator[tuple[int, Array]]:
+    """Yield the slow states, which come last in dx (columns,), and their changes."""
+    slow = [(s.number, len(s.slow.sigma)) for s in problem.streams if s.slow is not None]
+    nodes = len(problem.timeline.slow_stamps_ns)
+    at = len(dx) - sum(width for _, width in slow) * nodes
+    for number, width in sorted(slow):
+        for j in range(nodes):
+            yield keys.slow(number, j), dx[at : at + width]
+            at += width
