@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +20,8 @@ from graphloc.frontends.aerial.matcher import NO_POSE
 from graphloc.gather._gathering import Gathering
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
+from graphloc.time import NS_PER_S
+from graphloc.trajectory import Trajectory
 
 _MISLED = 0.25  # matches to scans that fit nowhere, below which the former are doubted
 _SURE = 0.5  # probability of a match's heading that counts for how the heading turns
@@ -70,7 +72,8 @@ def with_matches(
     tried, cut_off, turned = 0, 0, list[str]()
     for name, sensor in config.of_kind("aerial").items():
         gathered.sensor(name, dict.fromkeys((lidar.topic for lidar in sensor.lidars.values()), f"read by {name}"))
-        found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, warn=gathered.said.append)
+        around = _when_scanned(track, solution.time_offsets_s.get(name, 0.0))
+        found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, around, datum, warn=gathered.said.append)
         matched, turns = 0, list[tuple[float, float]]()
         for item in found:
             if item.match is not None:
@@ -90,6 +93,11 @@ def with_matches(
         gathered.said += few_matches(name, gathered.refused(name), matched)
         turned += turned_heading(name, turns)
     return Matches(gathered.recording(), cut_off > _CUT_OFF * tried, turned)
+
+
+def _when_scanned(track: Trajectory, late_s: float) -> Trajectory:
+    """Return a track by the stamps that scans have which are taken so much later than stamped, s."""
+    return replace(track, stamps_ns=track.stamps_ns - round(late_s * NS_PER_S)) if late_s else track
 
 
 def turned_heading(sensor: str, turns: Sequence[tuple[float, float]]) -> list[str]:
