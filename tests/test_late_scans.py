@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from graphloc import app
 from graphloc.config import AerialConfig, VesselConfig, load_config
 from graphloc.eval.metrics import TruthMetrics, compare_to_truth
+from graphloc.eval.report import Trust, verdict
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
 from graphloc.factors.aerial import ROW, slow
@@ -29,6 +31,7 @@ from graphloc.online._snapshot import Snapshot
 from graphloc.recording import Recording
 from graphloc.replay import replay
 from graphloc.solution import Cause, Health, Solution
+from graphloc.trajectory import Trajectory
 from tests.bagfactory import START_NS, Messages, S, write_bag
 from tests.faults import arrivals_of, feed
 from tests.slowly import with_few_states
@@ -138,6 +141,19 @@ def test_calibration_shows_what_the_track_has_taken() -> None:
     (line,) = (s for s in found.calibration.suggestions if s.key == f"sensors.{name}.time_offset_s")
     assert line.suggested == pytest.approx(-0.15, abs=0.03)
     assert line.action == "the track has it in it already, by stamp_sigma_s"
+
+
+@pytest.mark.parametrize(("taken_s", "with_care"), [(-0.15, False), (-0.05, True), (None, False)])
+def test_the_report_says_what_the_track_lacks_of_a_delay(taken_s: float | None, with_care: bool) -> None:
+    found = solved(0.05, 0.15)
+    (name,) = found.config.of_kind("aerial")
+    offsets = {} if taken_s is None else {name: taken_s}
+    assert found.solution.trajectory.cov is not None
+    sure = replace(found.solution.trajectory, cov=1e-2 * found.solution.trajectory.cov)
+    solution = replace(found.solution, time_offsets_s=offsets, trajectory=sure)
+    tracks = verdict(app.report_data(replace(found, solution=solution))).tracks
+    said = [reason.trust for reason in tracks[0].reasons if f"{name} and the IMU are" in reason.text]
+    assert said == ([Trust.WITH_CARE] if with_care else [])
 
 
 @pytest.mark.parametrize("mode", [offline, replayed], ids=["offline", "online"])
@@ -272,3 +288,27 @@ def test_no_pose_is_good_beside_a_clock_in_doubt(mode: str) -> None:
     found = done(recording, run.config).solution
     assert Health.GOOD not in found.health
     assert "aerial: by the recording times" in {reason.text for reason in found.health_reason}
+
+
+@pytest.mark.parametrize(("late_s", "sigma_s", "said"), [(0.3, 0.05, True), (0.3, 0.15, False), (0.0, 0.05, False)])
+def test_matches_that_turn_later_than_the_vessel_are_said(late_s: float, sigma_s: float, said: bool) -> None:
+    """Headings good to 0.1 deg, one in ten false by 20 deg, beside a track that turns by 5 deg to and fro."""
+    rng, t = np.random.default_rng(4), np.arange(0.0, 120.0, 0.1)
+    yaw = np.radians(5.0) * np.sin(2.0 * np.pi * t / 15.0) + 0.02 * t
+    track = Trajectory(
+        stamps_ns=START_NS + np.rint(t * S).astype(np.int64),
+        p_world_m=np.zeros((len(t), 3)),
+        R_world_body=Rotation.from_euler("z", yaw[:, None]).as_matrix(),
+    )
+    taken_s = np.arange(2.0, 118.0)
+    stamps_ns = START_NS + np.rint((taken_s + late_s) * S).astype(np.int64)
+    wrong = np.where(rng.uniform(size=len(taken_s)) < 0.1, np.radians(20.0), 0.0)
+    turn = (
+        np.interp(taken_s, t, yaw)
+        - np.interp(taken_s + late_s, t, yaw)
+        + rng.normal(0.0, np.radians(0.1), len(taken_s))
+    )
+    lines = _matches.late_turns("aerial", AerialConfig(stamp_sigma_s=sigma_s), track, stamps_ns, turn + wrong + 0.01)
+    assert bool(lines) == said
+    for line in lines:
+        assert line.startswith(f"aerial: its matches turn as the vessel does {-late_s:+.2f} +- 0.0")

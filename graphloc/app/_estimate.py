@@ -129,8 +129,9 @@ def _matched(
         gallery = Gallery()
         found = with_matches(recording, config, datum, solution, scans, progress, gallery)
         solution = solve(found.recording, config, datum, probe=calibrate.PROBE, progress=progress)
-    warnings = (*found.recording.warnings, *first.turned)
-    return replace(found.recording, warnings=warnings), solution, gallery
+    warnings = (*found.recording.warnings, *first.turned, *first.late)
+    doubts = (*found.recording.clock_doubts, *first.late)
+    return replace(found.recording, warnings=warnings, clock_doubts=doubts), solution, gallery
 
 
 def _matched_alone(config: VesselConfig) -> VesselConfig:
