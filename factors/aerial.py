@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matches of LiDAR scans to an aerial image, with several modes; the image itself is off by some decimetres, the mounts by a degree.
+"""Matches of LiDAR scans to an aerial image, with several modes; the image is off by some decimetres, mounts by a degree, clocks by 0.05 s.
 
-    z = (x, y, yaw)(T_world_body) + d + w,   w ~ N(0, C) of the mode,   d (3,): misregistration of the image, yaw of the mounts
+    z = (x, y, yaw)(T_world_body) + u tau + d + w,   w ~ N(0, C) of the mode
 
-d is constant over the run. The modes are those of `pose`; with d the factor has two states, and is relinearised at every pass
-(`graphloc.linear`).
+d (3,): misregistration of the image, yaw of the mounts; u: how x, y and yaw change; tau: how much later than stamped a scan was taken
+(negative: it is stamped late). d and tau are constant over the run. The modes are those of `pose`; with d or tau the factor has two states, and is
+relinearised at every pass (`graphloc.linear`). Not handled: of tau what u changes by in that time, and that it tells of the velocity.
 """
 
 from __future__ import annotations
@@ -15,22 +16,38 @@ import numpy as np
 
 from graphloc.config import AerialConfig
 from graphloc.factors import pose
-from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, SlowProcess
+from graphloc.frames import Array, skew
+from graphloc.graph import LATE, Attachment, Decision, GraphUpdate, Residual, SlowProcess
 from graphloc.measurements import PoseFix, PoseMode
 
 _AXES = ("x", "y", "yaw")
 
 
 def _off_sigma(config: AerialConfig) -> Array:
-    """Return the sigmas (3,) of what all matches are off by: east and north, m, and yaw, rad."""
+    """Return the sigmas (4,) of what all matches are off by: east and north, m, yaw, rad, and the stamps, s."""
     yaw_rad = float(np.radians(config.mount_sigma_deg)) if "yaw" in config.axes else 0.0
-    return np.array([config.image_sigma_m, config.image_sigma_m, yaw_rad])
+    return np.array([config.image_sigma_m, config.image_sigma_m, yaw_rad, config.stamp_sigma_s])
 
 
-def _shown_off(axes: tuple[str, ...], config: AerialConfig) -> Array:
+def _shown_off(axes: tuple[str, ...], config: AerialConfig, at: Attachment) -> Array:
     """Return d residual / d state (k, number of its axes)."""
-    return np.array([[float(a == own) for own in _AXES] for a in axes])[:, _off_sigma(config) > 0.0]
+    moves = np.append(at.sensor_velocity_mps()[:2], (at.T_world_body.rotation().matrix() @ at.gyro_radps)[2])
+    every = np.column_stack([np.eye(3), moves])[_picked(axes)]
+    return np.asarray(every[:, _off_sigma(config) > 0.0])
+
+
+def _picked(axes: tuple[str, ...]) -> list[int]:
+    return [_AXES.index(a) for a in axes]
+
+
+def _by_turning(axes: tuple[str, ...], config: AerialConfig, at: Attachment) -> Array:
+    """Return d (u tau) / d (body tangent of the state's pose), (k, 6)."""
+    found = np.zeros((3, 6))
+    if at.slow_value is not None and config.stamp_sigma_s > 0.0:
+        late_s, R = float(at.slow_value[-1]), at.T_world_body.rotation().matrix()
+        found[:2, :3] = (-R @ skew(late_s * at.swing_mps()))[:2]
+        found[2, :3] = (-R @ skew(late_s * at.gyro_radps))[2]
+    return found[_picked(axes)]
 
 
 def residuals(m: PoseFix, config: AerialConfig, at: Attachment) -> tuple[Residual, ...]:
@@ -38,13 +55,14 @@ def residuals(m: PoseFix, config: AerialConfig, at: Attachment) -> tuple[Residua
     plain = pose.residuals(m, config, at)
     if at.slow_value is None:
         return plain
-    shown = _shown_off(m.axes, config)
+    shown, by_pose = _shown_off(m.axes, config, at), plain[0].jacobian() + _by_turning(m.axes, config, at)
     moved, flat = shown @ at.slow_value, [k for k, a in enumerate(m.axes) if a in ("x", "y")]
     turned = [k for k, a in enumerate(m.axes) if a == "yaw"]
     return tuple(
         replace(
             r,
             raw=r.raw + moved,
+            jacobian=lambda: by_pose,
             slow_jacobian=lambda: shown,
             size_m=float(np.linalg.norm((r.raw + moved)[flat])) if flat else None,
             size_deg=float(np.degrees(np.linalg.norm((r.raw + moved)[turned]))) if turned else None,
@@ -54,21 +72,21 @@ def residuals(m: PoseFix, config: AerialConfig, at: Attachment) -> tuple[Residua
 
 
 def factors(m: PoseFix, config: AerialConfig, at: Attachment, decision: Decision) -> GraphUpdate | None:
-    """Return the native factor of the chosen mode; None where image or mounts may be off."""
+    """Return the native factor of the chosen mode; None where image, mounts or clock may be off."""
     return pose.factors(m, config, at, decision) if at.slow_key is None else None
 
 
 def slow(config: AerialConfig) -> SlowProcess | None:
-    """Return the image's misregistration and the yaw of the mounts."""
+    """Return the image's misregistration, the yaw of the mounts and the delay of the stamps."""
     sigma = _off_sigma(config)
     there = sigma > 0.0
     if not there.any():
         return None
     return SlowProcess(
         name="image offset",
-        axes=tuple(np.array(["east", "north", "yaw"])[there].tolist()),
-        units=tuple(np.array(["m", "m", "deg"])[there].tolist()),
-        scale=np.array([1.0, 1.0, 180.0 / np.pi])[there],
+        axes=tuple(np.array(["east", "north", "yaw", LATE])[there].tolist()),
+        units=tuple(np.array(["m", "m", "deg", "s"])[there].tolist()),
+        scale=np.array([1.0, 1.0, 180.0 / np.pi, 1.0])[there],
         sigma=sigma[there],
         time_constant_s=np.full(int(there.sum()), np.inf),
     )
@@ -77,7 +95,7 @@ def slow(config: AerialConfig) -> SlowProcess | None:
 def ideal(at: Attachment, config: AerialConfig) -> PoseFix:
     """Return the noise-free match at the attachment's state."""
     found = pose.ideal(at, config)
-    moved = np.zeros(len(config.axes)) if at.slow_value is None else _shown_off(config.axes, config) @ at.slow_value
+    moved = np.zeros(len(config.axes)) if at.slow_value is None else _shown_off(config.axes, config, at) @ at.slow_value
     mode = PoseMode(value=found.modes[0].value + moved, cov=found.modes[0].cov)
     return replace(found, sensor="aerial", modes=(mode,))
 

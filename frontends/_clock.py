@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.config import SensorConfig
+from graphloc.config import AerialConfig, SensorConfig
 from graphloc.errors import InputError
 from graphloc.time import NS_PER_S, duration_ns, utc_text
 
@@ -27,6 +27,8 @@ MOST_ON_ITS_WAY_S = 0.6
 """A fix is stamped late by no more if all that delays it is its way to the computer."""
 NO_DATE_NS = 946_684_800 * NS_PER_S
 """2000-01-01: a stamp before it is no date."""
+SCANS_AHEAD_S = 0.15
+"""Scans are stamped later than an IMU's samples that come at once by no more: these may take as long on their way."""
 GAIN_LIMIT_S = 0.1
 """A clock that gains more on another during a run is said to drift."""
 
@@ -160,6 +162,29 @@ def behind_s(own: Clock, imu: Clock, reference: Clock) -> float:
     """
     same = abs(own.latency_s - imu.latency_s) <= EPOCH_LIMIT_S
     return (imu if same else own).latency_s - reference.latency_s
+
+
+class ScanClock(NamedTuple):
+    """How far a LiDAR's stamps are ahead of the IMU's by the recording times, s: less than it by as much as its scans took longer to come."""
+
+    ahead_s: float
+
+    def said(self, sensor: str, config: AerialConfig) -> str:
+        """Return it in words where it is more than messages take and `stamp_sigma_s` allows for; else empty."""
+        allowed_s = 2.0 * config.stamp_sigma_s
+        if -max(MOST_ON_ITS_WAY_S, allowed_s) <= self.ahead_s <= max(SCANS_AHEAD_S, allowed_s):
+            return ""
+        way = "ahead of" if self.ahead_s > 0.0 else "behind"
+        at_least = f"at least {abs(self.ahead_s):.2f} s" if self.ahead_s > 0.0 else f"{abs(self.ahead_s):.2f} s"
+        taken = "" if self.ahead_s > 0.0 else ", or its scans come as late"
+        return (
+            f"{sensor}: by the recording times the clock of its LiDARs is {at_least} {way} the IMU's{taken}: set time_offset_s "
+            f"(to {config.time_offset_s - self.ahead_s:.2f} or less), or stamp_sigma_s to as much"
+        )
+
+    def astray(self, config: AerialConfig) -> bool:
+        """Whether scans are stamped later than they can have been taken, by more than bounds allow for."""
+        return self.ahead_s > max(SCANS_AHEAD_S, 2.0 * config.stamp_sigma_s)
 
 
 def clock_jumps(stamps_ns: Stamps, logs_ns: Stamps) -> NDArray[np.bool_]:

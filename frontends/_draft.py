@@ -10,7 +10,7 @@ from pathlib import Path
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, SlowErrorConfig
 from graphloc.frontends._assess_wander import slow_error_by
-from graphloc.frontends._draft_clock import recorded_lines, with_clock
+from graphloc.frontends._draft_clock import recorded_lines, scan_clock_lines, with_clock
 from graphloc.frontends._fixes import NOTHING_M, RTK_SIGMA_M, SCATTERS
 from graphloc.frontends._reports import (
     BODY_AXES,
@@ -114,7 +114,8 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         yield [f"# {item.topic}: left out, {item.world}{instead}"]
     lidars, cameras = (tuple(m for m in every if not m.left_out) for every in (inspection.lidars, inspection.cameras))
     if lidars:
-        yield [*_aerial_block(lidars, _clouds_hz(inspection, lidars)), *recorded_lines(inspection, lidars)]
+        block = _aerial_block(lidars, _clouds_hz(inspection, lidars))
+        yield [*block, *recorded_lines(inspection, lidars), *scan_clock_lines(inspection, lidars)]
     if cameras:
         yield [*_tags_block(cameras), *recorded_lines(inspection, cameras)]
     for other in (m for m in (*inspection.lidars, *inspection.cameras) if m.left_out):

@@ -5,7 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from graphloc.frontends._clock import EPOCH_LIMIT_S, MOST_ON_ITS_WAY_S, Clock, behind_s, reference_of
+from graphloc.frontends._clock import (
+    EPOCH_LIMIT_S,
+    MOST_ON_ITS_WAY_S,
+    SCANS_AHEAD_S,
+    Clock,
+    behind_s,
+    reference_of,
+)
 from graphloc.frontends._reports import (
     CompassReport,
     GnssReport,
@@ -106,6 +113,32 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
         sigma_s = max(sigma_s, abs(hinted[0]) if hinted else 0.0)
         lines.append(f"  stamp_sigma_s: {sigma_s:.2f}  # guess: {_STAMPS}{said}")
     return lines
+
+
+def scan_clock_lines(inspection: Inspection, lidars: tuple[MountedTopic, ...]) -> list[str]:
+    """Say how far the clocks of LiDARs are off the IMU's, by the recording times; none where they are not, or their stamps are not taken."""
+    topics = {t.topic.partition(" ")[0]: t for t in inspection.topics}
+    imu_s = next((t.latency_s[1] for i in inspection.imus if (t := topics.get(i.topic)) and t.latency_s), None)
+    own_s = [lidar.latency_s for lidar in lidars if lidar.latency_s is not None]
+    if recorded_lines(inspection, lidars):
+        return [
+            f"  stamp_sigma_s: {_ON_ITS_WAY_S:.2f}  # guess: how long a message takes is not known; estimated with the run"
+        ]
+    if (
+        imu_s is None or abs(imu_s) > EPOCH_LIMIT_S or not own_s
+    ):  # another clock than the IMU's is taken for the right one
+        return []
+    ahead_s = imu_s - min(own_s)
+    if -MOST_ON_ITS_WAY_S <= ahead_s <= SCANS_AHEAD_S:
+        return []
+    way = "ahead of" if ahead_s > 0.0 else "behind"
+    said = f"by the recording times their clock is {way} the IMU's by {abs(ahead_s):.2f} s, how much longer their scans take aside"
+    if abs(ahead_s) <= EPOCH_LIMIT_S:
+        return [f"  stamp_sigma_s: {abs(ahead_s):.2f}  # guess: {said}; estimated with the run"]
+    return [
+        f"  time_offset_s: {-ahead_s:.3f}  # guess: {said}",
+        f"  stamp_sigma_s: {_ON_ITS_WAY_S:.2f}  # guess: that, estimated with the run",
+    ]
 
 
 def recorded_lines(inspection: Inspection, mounted: tuple[MountedTopic, ...]) -> list[str]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import islice
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, ImuCo
 from graphloc.errors import InputError
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import courses_of_fixes, motion_of_fixes
+from graphloc.frontends._clock import ScanClock, corrected_ns, usual_latency_s
 from graphloc.frontends._mount_yaw import yaw_in_craft
 from graphloc.frontends._part import Bags
 from graphloc.frontends._reader import Reader, either
@@ -45,12 +47,16 @@ from graphloc.frontends.decode import (
     POSE,
     UNSTAMPED,
     Decoded,
+    stamp_ns_of,
     supported_types,
 )
 from graphloc.frontends.vendors import VENDORS
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix
 from graphloc.recording import Mounts, Progress, Recording, Span
+from graphloc.time import NS_PER_S
+
+_FIRST_SCANS = 20  # of a LiDAR, that tell its clock
 
 
 def check_bag(bags: Bags, config: VesselConfig) -> None:
@@ -86,12 +92,14 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
         bag.refuse_set_back([r.config.topic for r in sensors if r.config.kind == "imu"])
         tree = StaticTree() if any(s.enabled and s.mount.tf_frame for s in config.sensors.values()) else None
         rows = Reader(bag, topics, sensors, [b for b in (truth, check) if b], tree).read(progress)
+        scan_latencies = _scan_latencies(bag, config)
         warnings = list(bag.warnings)
 
     rows += reject_jumps(sensors, warnings)
     rows += reject_far_poses(sensors, warnings)
     rows += reject_set_back(sensors, [b for b in (truth, check) if b], warnings)
     warnings += clock_warnings(sensors)
+    doubts = _scan_clocks(sensors, scan_latencies, config, warnings)
     mounts = _mounts(config, tree, bag.name)
     warnings += _far_levers(config, mounts)
     imu, measurements, dropped = _usable(sensors, config, warnings)
@@ -117,7 +125,46 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
         check_speed=check_speed(check) if check else None,
         warnings=tuple(warnings),
         span=span,
+        clock_doubts=doubts,
     )
+
+
+def _scan_latencies(bag: Bag, config: VesselConfig) -> dict[str, float]:
+    """Return by aerial sensor how much later than stamped its scans are usually recorded, s, by the first of each LiDAR; of the earliest LiDAR."""
+    found = {}
+    for name, sensor in config.of_kind("aerial").items():
+        latency_s = []
+        for lidar in sensor.lidars.values() if sensor.stamps == "header" else ():
+            own = []
+            for raw in islice(bag.messages({lidar.topic}), _FIRST_SCANS) if lidar.topic in bag.topics else ():
+                try:
+                    stamp_ns = stamp_ns_of(bag.decode(raw), raw.msgtype, raw.log_ns)
+                except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; others will do
+                    continue
+                if stamp_ns is not None:
+                    own.append((raw.log_ns - corrected_ns(stamp_ns, sensor, raw.elapsed_ns)) / NS_PER_S)
+            if own:
+                latency_s.append(float(np.median(own)))
+        if latency_s:
+            found[name] = min(latency_s)
+    return found
+
+
+def _scan_clocks(
+    sensors: Sequence[Readings], latencies_s: Mapping[str, float], config: VesselConfig, warnings: list[str]
+) -> tuple[str, ...]:
+    """Warn of LiDARs whose clock is not the IMU's, by the recording times; return those lines that make all poses doubtful."""
+    imu = next((r for r in sensors if r.config.kind == "imu" and r.stamps_ns), None)
+    doubts = []
+    for name, latency_s in latencies_s.items() if imu is not None else ():
+        assert imu is not None
+        sensor = config.of_kind("aerial")[name]
+        clock = ScanClock(usual_latency_s(imu.stamps(), imu.logs()) - latency_s)
+        if line := clock.said(name, sensor):
+            warnings.append(line)
+        if clock.astray(sensor):
+            doubts.append(line)
+    return tuple(doubts)
 
 
 def _usable(

@@ -156,6 +156,10 @@ class Decision:
     kernel: KernelConfig | None = None
 
 
+LATE = "late"
+"""Axis of a slow state, a constant: the delay of all stamps of a sensor, which `time_offset_s` would correct."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SlowProcess:
     """A slow state: per axis a first-order Gauss-Markov process.
@@ -191,6 +195,11 @@ class SlowProcess:
     def mount_yaw(self) -> int | None:
         """Number of the axis that is the yaw of the sensor's mount; None where there is none."""
         return next((k for k, axis in enumerate(self.axes) if axis == "yaw" and self.constant[k]), None)
+
+    @property
+    def late(self) -> int | None:
+        """Number of the axis that is how much later than stamped the sensor measures, s; None where there is none."""
+        return self.axes.index(LATE) if LATE in self.axes else None
 
     @property
     def far_axes(self) -> NDArray[np.bool_]:

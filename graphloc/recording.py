@@ -88,6 +88,7 @@ class Recording:
         tag_views: sightings of tags that are not in the survey.
         warnings: one line each, for the report.
         span: which part of the bag it is; None: the whole.
+        clock_doubts: why no pose is to be called good: sensors that the bounds take for on one clock are not.
     """
 
     source: str
@@ -102,6 +103,7 @@ class Recording:
     tag_views: tuple[TagView, ...] = ()
     warnings: tuple[str, ...] = ()
     span: Span | None = None
+    clock_doubts: tuple[str, ...] = ()
 
     def of(self, kind: type[_M], sensor: str | None = None) -> list[_M]:
         """Return its measurements of a class, in order: all, or those of one sensor."""

@@ -371,6 +371,30 @@ def test_an_offset_of_three_and_a_half_sigmas_does_not_fit(right: app.Run) -> No
     ]  # fmt: skip
 
 
+LATE_FIXES: tuple[str, Offset] = ("gnss", "time")
+
+
+def test_an_offset_that_a_run_shows_though_not_well_is_not_said_to_be_unseen(right: app.Run) -> None:
+    """Of scans 0.5 s late a run told -0.4 +- 0.12 s, and read 'this run does not show it'; what the track has taken of it is beside it."""
+    off, name = OffsetEstimate(value=-0.4, sigma=0.12, drop=11.0), LATE_FIXES
+    assert _check(name, off, right.recording, right.config).said == "off by -0.4 s, 3.3 sigmas: doubtful"
+    told = _check(name, off, right.recording, right.config, -0.1).said
+    assert told == "off by -0.4 s, 3.3 sigmas: doubtful; -0.40 s by itself, -0.10 s in the track (stamp_sigma_s)"
+    unseen = _check(name, OffsetEstimate(value=-0.3, sigma=0.12, drop=6.0), right.recording, right.config).said
+    assert unseen.startswith("this run does not show it (1 sigma 0.12 s)")
+
+
+def test_of_a_delay_that_the_track_has_in_part_the_rest_is_asked_for(right: app.Run) -> None:
+    gnss = right.config.sensors["gnss"].model_copy(update={"stamp_sigma_s": 0.05})
+    config, off = right.config.with_sensors({"gnss": gnss}), OffsetEstimate(value=-0.4, sigma=0.05, drop=64.0)
+    for taken_s, action in (
+        (-0.38, "the track has it in it already, by stamp_sigma_s"),
+        (None, "the track has it in it already, by stamp_sigma_s"),
+        (-0.2, "the track has -0.2 s of it in it, by stamp_sigma_s; measure it, then set it"),
+    ):
+        assert _suggestion(("gnss", "time"), off, {}, right.recording, config, taken_s).action == action
+
+
 def test_a_clock_years_away_is_reported_to_milliseconds() -> None:
     """It read '-1.75e+09 s instead of -1.75e+09'."""
     clock = Suggestion(

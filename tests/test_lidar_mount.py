@@ -24,10 +24,11 @@ _TURNED_DEG = 1.5
 @pytest.mark.parametrize(
     ("changes", "axes", "sigma"),
     [
-        ({}, ("east", "north", "yaw"), (0.3, 0.3, np.radians(1.0))),
-        ({"mount_sigma_deg": 0.0}, ("east", "north"), (0.3, 0.3)),
-        ({"image_sigma_m": 0.0, "mount_sigma_deg": 2.0}, ("yaw",), (np.radians(2.0),)),
-        ({"axes": ("x", "y")}, ("east", "north"), (0.3, 0.3)),
+        ({}, ("east", "north", "yaw", "late"), (0.3, 0.3, np.radians(1.0), 0.05)),
+        ({"stamp_sigma_s": 0.0}, ("east", "north", "yaw"), (0.3, 0.3, np.radians(1.0))),
+        ({"mount_sigma_deg": 0.0}, ("east", "north", "late"), (0.3, 0.3, 0.05)),
+        ({"image_sigma_m": 0.0, "mount_sigma_deg": 2.0}, ("yaw", "late"), (np.radians(2.0), 0.05)),
+        ({"axes": ("x", "y"), "stamp_sigma_s": 0.1}, ("east", "north", "late"), (0.3, 0.3, 0.1)),
     ],
 )
 def test_what_all_matches_are_off_by(
@@ -40,9 +41,9 @@ def test_what_all_matches_are_off_by(
     np.testing.assert_allclose(process.sigma, sigma)
 
 
-def test_exact_mounts_and_an_exact_image_have_no_state() -> None:
-    assert slow(AerialConfig(image_sigma_m=0.0, mount_sigma_deg=0.0)) is None
-    assert slow(AerialConfig(image_sigma_m=0.0, axes=("x", "y"))) is None
+def test_exact_mounts_an_exact_image_and_an_exact_clock_have_no_state() -> None:
+    assert slow(AerialConfig(image_sigma_m=0.0, mount_sigma_deg=0.0, stamp_sigma_s=0.0)) is None
+    assert slow(AerialConfig(image_sigma_m=0.0, axes=("x", "y"), stamp_sigma_s=0.0)) is None
 
 
 def _turned(recording: Recording, by_deg: float) -> Recording:

@@ -29,6 +29,7 @@ PROBE: Probe = {
 }
 """What is looked at, by kind of sensor, those first that are wrong most often; heights show too little."""
 
+_MUCH_LESS = 0.3  # of a delay, that the track may lack
 _DOUBTFUL = 3.0  # sigmas: too few for a suggestion, too many for one that fits
 _AXIS: dict[Offset, int] = {"x": 0, "y": 1}
 _UNIT: dict[Offset, tuple[str, float]] = {
@@ -63,16 +64,20 @@ def calibrate(recording: Recording, config: VesselConfig, solution: Solution) ->
     suggestions, checks = [], []
     if solution.offsets is not None and len(solution.offsets.names):
         kinds = list(PROBE)
+
+        def taken(name: Name) -> float | None:
+            return solution.time_offsets_s.get(name[0]) if name[1] == "time" else None
+
         evidence = Evidence(solution.offsets, lambda name: kinds.index(config.sensors[name[0]].kind))
         wrong = evidence.wrong()
         estimates = evidence.estimates(wrong)
         for name in wrong:
             others = evidence.alternatives(name, wrong)
-            suggestions.append(_suggestion(name, estimates[name], others, recording, config))
+            suggestions.append(_suggestion(name, estimates[name], others, recording, config, taken(name)))
         for name in evidence.names:
             if name not in wrong:
                 found = evidence.estimates((*wrong, name))[name]
-                checks.append(_check(name, found, recording, config))
+                checks.append(_check(name, found, recording, config, taken(name)))
     if recording.imu is not None and recording.imu.sensor in config.sensors:
         for said in imu_noise(recording.imu, config.sensors[recording.imu.sensor], solution.offsets):
             (suggestions if isinstance(said, Suggestion) else checks).append(said)  # type: ignore[arg-type]
@@ -109,14 +114,22 @@ def _imu_at_origin(recording: Recording, config: VesselConfig) -> str:
 
 
 def _suggestion(
-    name: Name, found: OffsetEstimate, others: dict[Name, OffsetEstimate], recording: Recording, config: VesselConfig
+    name: Name,
+    found: OffsetEstimate,
+    others: dict[Name, OffsetEstimate],
+    recording: Recording,
+    config: VesselConfig,
+    taken_s: float | None = None,
 ) -> Suggestion:
+    """`taken_s`: what the track has taken of a delay, where it is estimated."""
     key, configured = _configured(name, recording, config)
     unit, factor = _UNIT[name[1]]
     action = "measure it, then set it"
     block = config.sensors[name[0]]
-    if name[1] == "time" and isinstance(block, GnssConfig) and block.stamp_sigma_s > 0.0:
+    if name[1] == "time" and isinstance(block, GnssConfig | AerialConfig) and block.stamp_sigma_s > 0.0:
         action = "the track has it in it already, by stamp_sigma_s"
+        if taken_s is not None and abs(found.value - taken_s) > _MUCH_LESS * abs(found.value):
+            action = f"the track has {taken_s:+.2g} s of it in it, by stamp_sigma_s; measure it, then set it"
     if name[1] in _AXIS and isinstance(block, GnssConfig | VelocityConfig) and block.mount_sigma_m > 0.0:
         action = "the track has it in it already, by mount_sigma_m; measure it, then set it and mount_sigma_m: 0"
     if name[1] in _AXIS and (shares := _of_one_antenna(name[0], recording, config)):
@@ -147,15 +160,19 @@ def _instead(name: Name, found: OffsetEstimate, recording: Recording, config: Ve
     return f"{key} {configured + factor * found.value:.3g} {unit}"
 
 
-def _check(name: Name, found: OffsetEstimate, recording: Recording, config: VesselConfig) -> Check:
+def _check(
+    name: Name, found: OffsetEstimate, recording: Recording, config: VesselConfig, taken_s: float | None = None
+) -> Check:
     key, configured = _configured(name, recording, config)
     unit, factor = _UNIT[name[1]]
-    if found.sigma > _USEFUL[name[1]]:
-        said = f"this run does not show it (1 sigma {significant(factor * found.sigma, 2)} {unit}); it would take {_WOULD_TELL[name[1]]}"
-    elif abs(found.z) > _DOUBTFUL and abs(found.value) > LEAST[name[1]]:
+    if abs(found.z) > _DOUBTFUL and abs(found.value) > LEAST[name[1]]:
         said = f"off by {significant(factor * found.value, 2)} {unit}, {abs(found.z):.1f} sigmas: doubtful"
+    elif found.sigma > _USEFUL[name[1]]:
+        said = f"this run does not show it (1 sigma {significant(factor * found.sigma, 2)} {unit}); it would take {_WOULD_TELL[name[1]]}"
     else:
         said = f"fits, within {significant(SIGMAS_95 * factor * found.sigma, 2)} {unit} (95 %)"
+    if taken_s is not None:
+        said += f"; {found.value:+.2f} s by itself, {taken_s:+.2f} s in the track (stamp_sigma_s)"
     return Check(
         key=key, unit=unit, configured=configured, change=factor * found.value, sigma=factor * found.sigma, said=said
     )

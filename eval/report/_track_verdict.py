@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphloc.chi2 import SIGMAS_95, chi2_95
-from graphloc.config import GnssConfig
+from graphloc.config import AerialConfig, GnssConfig
 from graphloc.eval.formatting import percent
 from graphloc.eval.metrics import Table, errors, held_out_errors, receiver_errors, squared_over_covariance
 from graphloc.eval.report._data import ReportData
@@ -179,8 +179,11 @@ def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
     speed_mps, bound_m = rms(_away(track.v_world_mps)), float(np.median(bounds_95(track.cov)[:, 0]))
     for found in data.calibration.suggestions:
         off_s, block = abs(found.suggested - found.configured), data.config.sensors[found.sensor]
-        if isinstance(block, GnssConfig) and block.stamp_sigma_s > 0.0:
-            continue  # it is estimated, and in the bounds
+        if isinstance(block, GnssConfig | AerialConfig) and block.stamp_sigma_s > 0.0:
+            taken_s = solution.time_offsets_s.get(found.sensor)
+            if isinstance(block, GnssConfig) or taken_s is None:
+                continue  # it is estimated, and in the bounds
+            off_s = abs(found.suggested - found.configured - taken_s)  # of what is far off, not all is taken
         if found.unit == "s" and block.kind in _PLACES and off_s * speed_mps > bound_m:
             yield Reason(
                 trust=Trust.WITH_CARE,

@@ -96,8 +96,8 @@ def smooth_recording(
         filters = (beside, *filters)
     tags, said = found_tags.about_tags(recording, config, solution)
     mounts, offsets = _track_warnings(solution, recording, config)
-    if mounts:
-        solution = solution.doubted(mounts[0].seen)
+    for doubt in (*recording.clock_doubts[:1], *(d.seen for d in mounts[:1])):
+        solution = solution.doubted(doubt)
     said += [*map(str, mounts), *offsets, *([never] if never else [])]
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution,
@@ -129,8 +129,9 @@ def _matched(
         gallery = Gallery()
         found = with_matches(recording, config, datum, solution, scans, progress, gallery)
         solution = solve(found.recording, config, datum, probe=calibrate.PROBE, progress=progress)
-    warnings = (*found.recording.warnings, *first.turned)
-    return replace(found.recording, warnings=warnings), solution, gallery
+    warnings = (*found.recording.warnings, *first.turned, *first.late)
+    doubts = (*found.recording.clock_doubts, *first.late)
+    return replace(found.recording, warnings=warnings, clock_doubts=doubts), solution, gallery
 
 
 def _matched_alone(config: VesselConfig) -> VesselConfig:
@@ -203,6 +204,8 @@ def replay_recording(
     replayed = replay(recording, config, scans=scans, speed=speed, lag_s=lag_s, stoppable=True, status=status)
     recording, solution = replayed.recording, replayed.solution
     mounts, offsets = _track_warnings(solution, recording, config)
+    if recording.clock_doubts:
+        solution = solution.doubted(recording.clock_doubts[0])
     said = [*suspect_tags(recording, config, solution), *map(str, mounts), *offsets]
     run = Run(recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution)
     return made_comparable(_with_underlay(run, scans))

@@ -86,6 +86,9 @@ class AerialConfig(AnyPoseConfig):
     mount_sigma_deg: NonNegative = 1.0
     """Yaw error of all matches alike (mounts of the LiDARs, rotation of the image), 1 sigma, deg; it is estimated. A mount
     measured by hand is off by a degree or two. 0: taken as given."""
+    stamp_sigma_s: NonNegative = 0.05
+    """Unknown delay of its stamps beyond `time_offset_s`, 1 sigma, s; it is estimated with the run, one for all of its LiDARs. Drivers stamp a
+    scan at its begin or its end, 0.1 s later, or on arrival. 0: stamps are right."""
     lidars: dict[str, LidarConfig] = Field(default_factory=dict)
     """The LiDARs by name."""
     hull_m: tuple[tuple[Finite, Finite], ...] = ()

@@ -70,7 +70,7 @@ class SensorConfig(Block):
     stamps: Literal["header", "recorded"] = "header"
     """When its messages were measured: `header`, as their headers say; `recorded`, when they were recorded, for a driver that
     leaves the headers' stamps empty. They are then late by as long as the message took, which no bound includes (but `stamp_sigma_s` of
-    `gnss`); see `time_offset_s`."""
+    `gnss` and `aerial`); see `time_offset_s`."""
     time_offset_s: Annotated[float, Field(ge=-4e9, le=4e9)] = 0.0
     """Added to the sensor's stamps, s."""
     clock_drift_ppm: Annotated[float, Field(ge=-1e5, le=1e5)] = 0.0

@@ -5,21 +5,26 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from graphloc.config import VesselConfig
+from graphloc.config import AerialConfig, VesselConfig
 from graphloc.eval.match_picture import Gallery
-from graphloc.frames import Datum, wrap_angle
+from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.frontends._part import Bags
+from graphloc.frontends._time_offsets import heading_time_offset
+from graphloc.frontends._turning import Turning
 from graphloc.frontends.aerial import match_bag
 from graphloc.frontends.aerial.matcher import NO_POSE
 from graphloc.gather._gathering import Gathering
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
+from graphloc.time import NS_PER_S
+from graphloc.trajectory import Trajectory
 
 _MISLED = 0.25  # matches to scans that fit nowhere, below which the former are doubted
 _SURE = 0.5  # probability of a match's heading that counts for how the heading turns
@@ -28,6 +33,8 @@ _TURNED_SIGMAS, _TOLD_RAD, _FEWEST = (
     np.radians(10.0),
     5,
 )  # of the heading without matches; a larger sigma tells none
+_ALIKE_RAD = np.radians(5.0)  # that right headings of matches differ by
+_FAR_OFF = 3.0  # sigmas of the clock
 _CUT_OFF = 0.1  # share of scans whose search windows were too small, above which they are matched once more
 
 
@@ -44,11 +51,13 @@ class Matches(NamedTuple):
 
     Attributes:
         cut_off: many of the windows were too small for what the solution left open. turned: what is said of headings (`turned_heading`).
+        late: what is said of stamps by how headings turn (`late_turns`).
     """
 
     recording: Recording
     cut_off: bool
     turned: list[str]
+    late: Sequence[str] = ()
 
 
 def with_matches(
@@ -67,11 +76,12 @@ def with_matches(
     """
     gathered, track = Gathering(recording), solution.trajectory
     span_s = int((track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9)
-    tried, cut_off, turned = 0, 0, list[str]()
+    tried, cut_off, turned, late = 0, 0, list[str](), list[str]()
     for name, sensor in config.of_kind("aerial").items():
         gathered.sensor(name, dict.fromkeys((lidar.topic for lidar in sensor.lidars.values()), f"read by {name}"))
-        found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, warn=gathered.said.append)
-        matched, turns = 0, list[tuple[float, float]]()
+        around = _when_scanned(track, solution.time_offsets_s.get(name, 0.0))
+        found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, around, datum, warn=gathered.said.append)
+        matched, turns, turned_ns = 0, list[tuple[float, float]](), list[int]()
         for item in found:
             if item.match is not None:
                 tried, cut_off = tried + 1, cut_off + item.match.cut_off
@@ -82,6 +92,7 @@ def with_matches(
                 best, prior = item.match.modes[0], item.match.prior
                 if item.match.of_heading > _SURE:
                     turns.append((float(wrap_angle(best.pose[2] - prior.pose[2])), float(prior.sigma[2])))
+                    turned_ns.append(item.stamp_ns)
                 gathered.take(item.match.fix(item.stamp_ns, name, item.since, sensor.axes))
             else:
                 gathered.refuse(name, item.stamp_ns, item.why_not)
@@ -89,7 +100,15 @@ def with_matches(
         progress("matching", span_s, span_s)
         gathered.said += few_matches(name, gathered.refused(name), matched)
         turned += turned_heading(name, turns)
-    return Matches(gathered.recording(), cut_off > _CUT_OFF * tried, turned)
+        late += late_turns(
+            name, sensor, around, np.array(turned_ns, dtype=np.int64), np.array([turn for turn, _ in turns])
+        )
+    return Matches(gathered.recording(), cut_off > _CUT_OFF * tried, turned, late)
+
+
+def _when_scanned(track: Trajectory, late_s: float) -> Trajectory:
+    """Return a track by the stamps that scans have which are taken so much later than stamped, s."""
+    return replace(track, stamps_ns=track.stamps_ns - round(late_s * NS_PER_S)) if late_s else track
 
 
 def turned_heading(sensor: str, turns: Sequence[tuple[float, float]]) -> list[str]:
@@ -108,6 +127,32 @@ def turned_heading(sensor: str, turns: Sequence[tuple[float, float]]) -> list[st
         f"{np.degrees(sigma):.1f} deg (1 sigma); bounds include neither a LiDAR's mount nor a heading sensor that is off by so much"
     )
     return [line]
+
+
+def late_turns(
+    sensor: str, config: AerialConfig, track: Trajectory, stamps_ns: NDArray[np.int64], turn_rad: Array
+) -> list[str]:
+    """Say so where sure matches turn later or earlier than the vessel, by more than the configuration allows for: a line, or none.
+
+    By the graph their headings, whose errors are alike for minutes, tell little of that; but such errors do not follow the vessel's turns.
+
+    Args:
+        track: without matches. stamps_ns: (N,) of the matches. turn_rad: (N,) their yaw less the track's.
+    """
+    order = np.argsort(stamps_ns, kind="stable")
+    stamps_ns, turn_rad = stamps_ns[order], turn_rad[order]
+    near = np.abs(turn_rad - np.median(turn_rad)) < _ALIKE_RAD if len(turn_rad) else np.zeros(0, dtype=bool)
+    if near.sum() < _FEWEST:
+        return []
+    own_s = (track.stamps_ns - track.stamps_ns[0]) / NS_PER_S
+    turning = Turning(int(track.stamps_ns[0]), own_s, np.unwrap(track.yaw_rad))
+    at_s = (stamps_ns[near] - track.stamps_ns[0]) / NS_PER_S
+    found = heading_time_offset(turning, stamps_ns[near], np.interp(at_s, own_s, turning.turned_rad) + turn_rad[near])
+    if found is None or abs(found[0]) <= _FAR_OFF * config.stamp_sigma_s:
+        return []
+    value_s, sigma_s = found
+    said = f"{sensor}: its matches turn as the vessel does {value_s:+.2f} +- {sigma_s:.2f} s from their stamps, by more than stamp_sigma_s"
+    return [f"{said} allows for: set time_offset_s to {config.time_offset_s + value_s:.2f}"]
 
 
 def few_matches(sensor: str, reasons: Counter[str], matched: int) -> list[str]:

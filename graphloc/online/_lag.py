@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.frames import Array
-from graphloc.graph import Residual, antenna_off_m, corrections
+from graphloc.graph import TIME_OFFSET, Residual, antenna_off_m, corrections
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
@@ -30,6 +30,7 @@ from graphloc.online._unmodelled import BeforeStart, ErrorSizes, UnmodelledError
 from graphloc.online._window import Window
 from graphloc.position_jumps import why_in_doubt
 from graphloc.solve._decide import AGREES
+from graphloc.solve._health import why_late
 from graphloc.solve._imu_noise import log_likelihood
 from graphloc.solve._warnings import noisier_warning
 
@@ -232,7 +233,7 @@ class Lag:
         """Return a warning on each delay or antenna's place that newly is clearly far from where it is set."""
         lines = list[str]()
         for stream in self.problem.streams.values() if self.fresh else ():
-            for key, line in self._constants.far_off(stream):
+            for key, line in (*self._constants.far_off(stream), *self._states.late_far_off(stream)):
                 if key not in stream.receiver.far_off:
                     stream.receiver.far_off.add(key)
                     lines.append(line)
@@ -245,10 +246,15 @@ class Lag:
         return [n for n, s in streams if s.left_out is not None and s.receiver.jump.jumps != s.jumps]
 
     def in_doubt(self, stamp_ns: int) -> str:
-        """Return why the health cannot be good at a stamp: the only position sensor has jumped; empty where it has not."""
+        """Return why the health cannot be good at a stamp: the only position sensor has jumped, or scans are stamped far off; empty where neither is."""
         streams = self.problem.streams.items()  # where a slow error is left out, the bounds include it
         doubtful = [n for n, s in streams if (s.left_out is None or s.jumps) and s.receiver.jump.doubtful(stamp_ns)]
-        return "; ".join(why_in_doubt(n) for n in doubtful)
+        late = [
+            n
+            for n, s in streams
+            if s.slow is not None and s.slow.late is not None and TIME_OFFSET in s.receiver.far_off
+        ]
+        return "; ".join([*map(why_in_doubt, doubtful), *map(why_late, late)])
 
     @property
     def denied(self) -> Mapping[str, int]:

@@ -14,13 +14,15 @@ from graphloc import keys
 from graphloc.build import bias_step, closing_variance, nav_state, slow_begin, slow_end, slow_step
 from graphloc.errors import SolveError
 from graphloc.frames import Array
-from graphloc.graph import Attachment, Going, Residual
+from graphloc.graph import TIME_OFFSET, Attachment, Going, Residual
 from graphloc.motion_model import UNSURE_MPS, Moving
 from graphloc.online._anchor import Anchor, in_world, without_prior
 from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window
+from graphloc.solve._health import FAR_OFF
 from graphloc.solve._prediction import Prediction, prediction_of
+from graphloc.solve._warnings import late_far_off
 
 _HOLE_S = 1.0  # an IMU gap that the motion model is not applied across
 _AWAY_M = 2e3  # no vessel moves so far between two states, even across the longest IMU gap that is bridged
@@ -272,6 +274,23 @@ class States:
             if at.slow_key is not None and residual.slow_jacobian is not None:
                 J[rows, first[at.slow_key] : first[at.slow_key] + width] = residual.slow_jacobian()
         return np.asarray(J @ window.covariance([*poses, *slow]) @ J.T)
+
+    def late_s(self, stream: LiveStream) -> tuple[float, float] | None:
+        """Return how much later than stamped a sensor measures, and the sigma of that, s, where its slow state tells it."""
+        if stream.slow is None or (axis := stream.slow.late) is None:
+            return None
+        key = keys.slow(stream.number, self._problem.timeline.slow_of[self._newest.number])
+        if not self._window.is_committed(key):
+            return None
+        var = float(self._window.covariance([key])[axis, axis])
+        return float(self._window.values.atVector(key)[axis]), float(np.sqrt(var))
+
+    def late_far_off(self, stream: LiveStream) -> list[tuple[str, str]]:
+        """Return `TIME_OFFSET` and a line where the stamps of a sensor are clearly far from where they are set."""
+        found = self.late_s(stream)
+        if found is None or abs(found[0]) <= FAR_OFF * found[1]:
+            return []
+        return [(TIME_OFFSET, line) for line in late_far_off(stream.name, stream.slow, found[0])]
 
     def links(self) -> list[Held]:
         """Return the IMU factors, but for the oldest tenth: the solver cannot relinearise the poses there."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc import keys
 from graphloc.build import Problem, Stream
 from graphloc.frames import Array
 from graphloc.position_jumps import LASTS_S, why_in_doubt
@@ -22,6 +24,22 @@ _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
 CONTRADICTING_COST = 3.0  # over the expected cost: noise that is configured too small alone does not cost so much
 
 
+FAR_OFF = 3.0
+"""Sigmas of its setting from which an estimate is said to be far from it."""
+
+
+def late_of(stream: Stream, values: gtsam.Values) -> float | None:
+    """Return how much later than stamped a sensor measures, s, where its slow state tells it."""
+    if stream.slow is None or (axis := stream.slow.late) is None:
+        return None
+    return float(values.atVector(keys.slow(stream.number, 0))[axis])
+
+
+def why_late(sensor: str) -> str:
+    """Return why no pose beside a sensor whose stamps are far off is called good."""
+    return f"the stamps of {sensor} are far off what stamp_sigma_s allows for"
+
+
 def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[str]:
     """Why each state cannot be called good; empty where nothing speaks against it."""
     stamps_ns, why = problem.timeline.stamps_ns, ""
@@ -29,6 +47,12 @@ def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[st
         why = "the solver did not converge"
     elif result.noise_scale > LARGEST_NOISE_SCALE or stats.cost > CONTRADICTING_COST * max(stats.expected_cost, 1.0):
         why = "the measurements contradict each other"
+    late = (
+        (s.name, late_s / float(s.slow.sigma[s.slow.late or 0]))
+        for s in problem.streams
+        if s.slow is not None and (late_s := late_of(s, result.values)) is not None
+    )
+    why = why or next((why_late(name) for name, off in late if abs(off) > FAR_OFF), "")
     said = [why] * len(stamps_ns)
     for stream in problem.streams:
         if not why and stream.left_out is None and stream.slow is None:  # else the bounds allow for a slow error

@@ -17,6 +17,7 @@ the GNSS error.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from itertools import pairwise
 
@@ -38,7 +39,7 @@ BLOCK_S = 2.0
 _ROUNDS, _SAME_WEIGHT, _SAME = 6, 0.2, 0.1
 # How far an offset may be off while weights are chosen, 1 sigma: m, rad, s.
 _FREE: dict[Offset, float] = {"x": 3.0, "y": 3.0, "yaw": 0.5, "time": 1.0}
-_HELD_RAD = 1e-6  # sigma of a mount that is held
+_HELD = 1e-6  # sigma, rad or s, of what is held
 
 
 def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
@@ -111,7 +112,7 @@ def _in_blocks(rows: Rows, left: Array, r: Array) -> tuple[Array, Array]:
 
 
 def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values, StartPrior]:
-    """Return the problem without mount offsets that are states already, that of the IMU among them, and with the slow errors that were left out."""
+    """Return the problem without offsets of mounts and stamps that are states already, that of the IMU's mount among them, and with the slow errors that were left out."""
     problem, values = with_left_out(result.problem, result.values)
     prior = result.prior
     if problem.imu_turn_rad.any():
@@ -120,8 +121,8 @@ def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values, Star
     streams = []
     for stream in problem.streams:
         slow = stream.slow
-        if slow is not None and slow.mount_yaw is not None:
-            slow = _without_mount(problem, stream, slow, values)
+        if slow is not None and (held := {slow.mount_yaw, slow.late} - {None}):
+            slow = _without(held, problem, stream, slow, values)
         streams.append(replace(stream, slow=slow, constants=_surveyed(stream)))
     return replace(problem, streams=tuple(streams)), values, prior
 
@@ -131,15 +132,17 @@ def _surveyed(stream: Stream) -> tuple[Constant, ...]:
     return tuple(constant for constant in stream.constants if not constant.corrects)
 
 
-def _without_mount(problem: Problem, stream: Stream, slow: SlowProcess, values: gtsam.Values) -> SlowProcess | None:
-    """Return the slow state without the yaw of a compass, or of LiDARs, which is held as configured (in `values` too); None where nothing else is in it."""
-    if len(slow.axes) == 1:
+def _without(
+    axes: Collection[int | None], problem: Problem, stream: Stream, slow: SlowProcess, values: gtsam.Values
+) -> SlowProcess | None:
+    """Return the slow state without some axes (the yaw of a mount, a delay), which are held as configured (in `values` too); None where nothing else is in it."""
+    if len(slow.axes) == len(axes):
         return None
-    held = np.arange(len(slow.axes)) == slow.mount_yaw
+    held = np.array([k in axes for k in range(len(slow.axes))])
     for j in range(len(problem.timeline.slow_stamps_ns)):
         key = keys.slow(stream.number, j)
         values.update(key, np.where(held, 0.0, values.atVector(key)))
-    return replace(slow, sigma=np.where(held, _HELD_RAD, slow.sigma))
+    return replace(slow, sigma=np.where(held, _HELD, slow.sigma))
 
 
 def _columns(

@@ -29,7 +29,7 @@ from graphloc.solve._covariances import (
 )
 from graphloc.solve._doubt import widen_by_doubt
 from graphloc.solve._drift import with_drift_taken_back
-from graphloc.solve._health import health_over_time, misfits, since_agreed
+from graphloc.solve._health import health_over_time, late_of, misfits, since_agreed
 from graphloc.solve._imu_mount import mount_error
 from graphloc.solve._ledger import ledger_of
 from graphloc.solve._unmodelled import unmodelled
@@ -93,7 +93,10 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         berths=tuple(_berth_tracks(problem, result, trajectory)),
         ledger=ledger,
         stats=stats,
-        time_offsets_s={name: found[TIME_OFFSET] for name, found in corrected.items() if TIME_OFFSET in found},
+        time_offsets_s={
+            **{name: found[TIME_OFFSET] for name, found in corrected.items() if TIME_OFFSET in found},
+            **{s.name: late_s for s in problem.streams if (late_s := late_of(s, result.values)) is not None},
+        },
         antennas_off_m={
             name: off_m for name, found in corrected.items() if (off_m := antenna_off_m(found)) is not None
         },

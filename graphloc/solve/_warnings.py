@@ -13,19 +13,18 @@ from graphloc import keys
 from graphloc.build import CONSTANT_TAILS, Problem, Stream, solved_constants
 from graphloc.config import SIGMA_SCALES, SensorConfig
 from graphloc.frames import Array
-from graphloc.graph import Constant, SlowProcess, corrections
+from graphloc.graph import TIME_OFFSET, Constant, SlowProcess, corrections
 from graphloc.position_jumps import jump_warnings, largest_sigma
 from graphloc.series import runs
 from graphloc.solution import Graded, SolveStats
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
 from graphloc.solve._decide import AGREES
-from graphloc.solve._health import CONTRADICTING_COST
+from graphloc.solve._health import CONTRADICTING_COST, FAR_OFF, late_of
 from graphloc.solve._imu_mount import MountError, mount_sigma_rad
 from graphloc.solve._imu_noise import too_quiet
 from graphloc.solve._passes import expected_cost
 from graphloc.time import stamps_of, utc_text
 
-FAR_OFF = 3.0
 _TURNED, _TOLD = 2.5, 0.1  # sigmas; share of a prior's variance
 _MUCH_NOISIER = 1.5
 _SMALL_M = 0.1  # a slow error below it is that of RTK
@@ -102,6 +101,8 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
         return 0.0, ""
     value = result.values.atVector(keys.slow(stream.number, 0))
     far = np.where(slow.constant, np.abs(value) / slow.sigma, 0.0)
+    if slow.late is not None:
+        far[slow.late] = 0.0  # it is no mount (`late_far_off`)
     k = int(np.argmax(far))
     where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.3g} {slow.units[k]}"
     return float(far[k]), f"its {slow.offset or slow.name} is estimated {far[k]:.1f} sigmas ({where})"
@@ -244,7 +245,19 @@ def far_off(name: str, constant: Constant, value: Array, mount: Any) -> Iterator
     """
     for (key, by), sigma in zip(corrections([(constant, value)], mount).items(), constant.sigma, strict=False):
         if (off := abs(by) / sigma) > FAR_OFF:
-            yield key, by, f"{name}: {key} is {off:.1f} sigmas from where it is set: add {by:+.3f} to it"
+            yield key, by, _add_to(name, key, by, off)
+
+
+def late_far_off(name: str, slow: SlowProcess | None, late_s: float) -> list[str]:
+    """Say where the stamps of a sensor are far from where they are set, by the estimate that its slow state has of it: a line, or none."""
+    if slow is None or slow.late is None:
+        return []
+    off = abs(late_s) / float(slow.sigma[slow.late])
+    return [_add_to(name, TIME_OFFSET, late_s, off)] if off > FAR_OFF else []
+
+
+def _add_to(name: str, key: str, by: float, off: float) -> str:
+    return f"{name}: {key} is {off:.1f} sigmas from where it is set: add {by:+.3f} to it"
 
 
 def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
@@ -256,6 +269,7 @@ def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
         )
     else:
         warnings += _turned_mount(stream, result)
+    warnings += late_far_off(stream.name, stream.slow, late_of(stream, result.values) or 0.0)
     for constant, value in solved_constants(stream, result.values):
         warnings += [said for *_, said in far_off(stream.name, constant, value, stream.mount)]
         if not constant.corrects and (off := np.abs(value / constant.sigma).max()) > FAR_OFF:
