@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from graphloc import factors
 from graphloc.config import (
@@ -29,8 +30,8 @@ from tests.test_inspect import DATUM, ROLL_90, G, drive, look, rotation_z
 WAVE_S, WAVE_RAD = 3.0, 0.03
 
 
-def boat(make: Messages, yaw_deg: float) -> list[Item]:
-    """At 1.2 m/s in waves, turning to and fro; an IMU at 50 Hz turned by `yaw_deg`, fixes at 5 Hz that scatter by 0.3 m.
+def boat(make: Messages, yaw_deg: float, scatter_m: float = 0.3) -> list[Item]:
+    """At 1.2 m/s in waves, turning to and fro; an IMU at 50 Hz turned by `yaw_deg`, fixes at 5 Hz that scatter by `scatter_m`.
 
     Waves of 0.03 rad put 0.3 m/s^2 of gravity into the horizontal accelerations; the turns are worth 0.12 m/s^2.
     """
@@ -46,7 +47,7 @@ def boat(make: Messages, yaw_deg: float) -> list[Item]:
     gyro = np.column_stack([0 * t, 0 * t, rate])
     accel += np.array([0.0, 0.0, 9.81]) + rng.normal(0, 0.02, accel.shape)
     gyro += rng.normal(0, 1e-3, gyro.shape)
-    places = np.column_stack([way.real, way.imag, 0 * t]) + 0.3 * rng.normal(size=(len(t), 3))
+    places = np.column_stack([way.real, way.imag, 0 * t]) + scatter_m * rng.normal(size=(len(t), 3))
     lla, R = DATUM.geodetic_from_enu(places), rotation_z(yaw_deg)
     items: list[Item] = []
     for k in range(len(t)):
@@ -96,6 +97,34 @@ def test_fixes_of_a_slow_craft_in_waves_tell_the_yaw_of_its_imu(yaw_deg: float, 
     mount = found.imus[0].mount
     assert "yaw by the motion of /fix" in mount.evidence
     assert abs((mount.rpy_deg[2] - yaw_deg + 180.0) % 360.0 - 180.0) < 0.5
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 25.0, -25.0])
+def test_a_tilted_imu_on_its_head_looks_ahead_where_no_motion_tells(tilt_deg: float, tmp_path: Path) -> None:
+    """As one that is not tilted does; levelled the shortest way, its x was drafted astern."""
+    make = Messages(2)
+    R = Rotation.from_euler("yx", [tilt_deg, 180.0], degrees=True).as_matrix()
+    at = [START_NS + k * S // 50 for k in range(500)]
+    items: list[Item] = [
+        ("/imu", ns, make.imu(ns, (R.T @ [0.01 * (k % 3), 0.0, 9.81]).tolist())) for k, ns in enumerate(at)
+    ]
+    items.append(("/fix", at[-1], make.fix(at[-1])))
+    _, config, _ = look(tmp_path, items, make)
+    np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, R, atol=0.01)
+
+
+def test_floats_beside_rtk_do_not_hide_the_yaw_of_an_imu(tmp_path: Path) -> None:
+    """They wander by metres, as they claim; 0 was drafted of an IMU that looks astern."""
+    rng, make = np.random.default_rng(5), Messages(2)
+    items = boat(make, 180.0, 0.02)
+    fixes = [m for topic, _, m in items if topic == "/fix"]
+    wander = np.cumsum(rng.normal(size=(len(fixes), 2)), axis=0) * 2e-5
+    for k, m in enumerate(fixes):
+        off = wander[k] if k > 0.7 * len(fixes) else (0.0, 0.0)
+        m.latitude, m.longitude = m.latitude + off[0], m.longitude + off[1]
+        m.position_covariance[[0, 4, 8]] = 4.0 if k > 0.7 * len(fixes) else 4e-4
+    found, _, _ = look(tmp_path, items, make)
+    assert found.imus[0].mount.rpy_deg[2] == pytest.approx(180.0, abs=0.5)
 
 
 @pytest.mark.parametrize(("seconds", "yaw_deg"), [(60, 0.0), (90, 90.0), (200, 90.0)])
