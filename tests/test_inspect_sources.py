@@ -180,6 +180,31 @@ def test_axes_that_tf_static_does_not_know_are_drafted_as_measured(axes: str, tm
     assert "guess: not as in tf" in text
 
 
+@pytest.mark.parametrize(("height_m", "above_m"), [(-0.7, 0.7), (0.7, None)])
+@pytest.mark.parametrize("base", [True, False])
+def test_antennas_in_a_tf_that_looks_down_are_drafted_above(
+    height_m: float, above_m: float | None, base: bool, tmp_path: Path
+) -> None:
+    """An INS's own axes as the body's: an antenna half a metre to port was drafted to starboard and below, and the track 1 m off."""
+    make = Messages(2)
+    edges = [("imu_link", "gps", (-0.8, -0.5, height_m), (0, 0, 0, 1))]
+    edges += [("base_link", "imu_link", (0.2, 0.1, -0.3), (0, 0, 0, 1))] if base else []
+    items = [("/tf_static", START_NS, make.transforms(edges)), *drive(make, AXES["upside down"])]
+    fixes = [(at, m) for topic, at, m in items if topic == "/fix"]
+    ins = [make.fix(at, m.latitude, m.longitude, m.altitude, frame="imu_link") for at, m in fixes]
+    items += [("/ekf/fix", at, m) for (at, _), m in zip(fixes, ins, strict=True)]
+    _, config, text = look(tmp_path, items, make)
+    gnss, imu = config.sensors["gnss"].mount, config.sensors["imu"].mount
+    np.testing.assert_allclose(imu.R_body_sensor, AXES["upside down"], atol=0.02)
+    if above_m is None:  # axes of the driver, under the frame of a URDF
+        assert gnss.tf_frame == "gps"
+        assert imu.xyz_m == ((0.2, 0.1, -0.3) if base else (0.0, 0.0, 0.0))
+    else:
+        assert gnss.xyz_m == pytest.approx((-0.6, 0.4, 1.0) if base else (-0.8, 0.5, 0.7))
+        assert imu.xyz_m == pytest.approx((0.2, -0.1, 0.3) if base else (0.0, 0.0, 0.0))
+        assert "whose body looks ahead, to starboard, down" in text
+
+
 @pytest.mark.parametrize("turned_deg", [0.0, 90.0])
 def test_a_mount_that_the_fixes_deny_is_reported_when_a_bag_is_read(turned_deg: float, tmp_path: Path) -> None:
     """A compass that tells the right heading leaves the course right: nothing else was said, and the track was metres off."""
