@@ -19,6 +19,9 @@ from graphloc.recording import Recording
 from graphloc.trajectory import Trajectory, bounds_95
 
 _MOVES_MPS = 1.0  # below, a vessel may well drift sideways
+_CREEPS_MPS = 0.3  # a robot
+# Least spread of the headings; that of the angle between course and heading over it: 1 where a current sets the craft.
+_TURNS, _STEADIER = 0.02, 0.25
 _WAY_M, _MOST = 30.0, 0.6  # least way to judge by; share of it
 _SIDEWAYS_DEG, _TILTED_DEG = 45.0, 45.0
 _KNOWN_DEG = 20.0  # 95 % bound of a heading that is claimed to be known
@@ -60,7 +63,10 @@ def _sideways(track: Trajectory, recording: Recording, config: VesselConfig) -> 
         return None
     v, step_s = track.v_world_mps, np.diff(track.stamps_ns, append=track.stamps_ns[-1]) / 1e9
     speed = np.hypot(v[:, 0], v[:, 1])
-    judged = (speed > _MOVES_MPS) & (bounds_95(track.cov)[:, 2] < _KNOWN_DEG) & (step_s < 1.0)
+    known = (bounds_95(track.cov)[:, 2] < _KNOWN_DEG) & (step_s < 1.0)
+    fast = float((speed * step_s)[known & (speed > _MOVES_MPS)].sum()) >= _WAY_M
+    above_mps = _MOVES_MPS if fast else _CREEPS_MPS
+    judged = known & (speed > above_mps)
     way_m = (speed * step_s)[judged]
     if way_m.sum() < _WAY_M:
         return None
@@ -70,10 +76,13 @@ def _sideways(track: Trajectory, recording: Recording, config: VesselConfig) -> 
         return None
     seen = (
         f"the course is more than {_SIDEWAYS_DEG:.0f} deg off the solved heading for {percent(share)} of the {way_m.sum():.0f} m "
-        f"made above {_MOVES_MPS:.0f} m/s"
+        f"made above {above_mps:g} m/s"
     )
     unless = "unless the vessel goes sideways or astern"
     mean = complex((way_m * np.exp(1j * off)).sum() / way_m.sum())
+    turns = 1.0 - abs(complex((way_m * np.exp(1j * track.yaw_rad[judged])).sum() / way_m.sum()))
+    if not fast and (abs(mean) < _STEADY or turns < _TURNS or 1.0 - abs(mean) > _STEADIER * turns):
+        return None  # a current is steady in the world, a wrong mount in the craft
     if abs(mean) < _STEADY or recording.imu is None or recording.imu.sensor not in config.sensors:
         wrong = (
             "the heading is wrong: check the IMU's axes (mount, signs of its rates and accelerations) and the compasses"

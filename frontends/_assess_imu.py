@@ -39,6 +39,7 @@ _QUIET_S, _STANDS_S = 2, 1.5
 _TILTED_DEG, _QUARTER_DEG, _OVERRULES = 20.0, 20.0, 0.6
 _SLIGHTLY_DEG = 3.0  # off a quarter turn, from which it is said
 _ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, or an antenna far ahead, make less
+_ON_ITS_HEAD = -0.7  # of gravity along z, below which a sensor is so, however it is tilted
 
 
 def samples_of(imu: TopicData) -> tuple[NDArray[np.intp], list[str]]:
@@ -130,14 +131,18 @@ def _turned(
 
 
 def _level(axis: Array) -> Array:
-    """Return the smallest rotation (3, 3) that takes a unit vector to +z (half a turn about x for -z)."""
-    z = np.array([0.0, 0.0, 1.0])
-    cross = np.cross(axis, z)
+    """Return the smallest rotation (3, 3) that takes a unit vector to +z; of a sensor on its head, after half a turn about x.
+
+    Either way x stays ahead. From -z the smallest rotation alone is about any axis: of a sensor tilted a little forward, x went astern.
+    """
+    turned = np.diag([1.0, -1.0, -1.0]) if axis[2] < _ON_ITS_HEAD else np.eye(3)
+    up, z = turned @ axis, np.array([0.0, 0.0, 1.0])
+    cross = np.cross(up, z)
     sine = float(np.linalg.norm(cross))
     if sine < 1e-9:
-        return np.diag([1.0, 1.0, 1.0]) if axis[2] > 0.0 else np.diag([1.0, -1.0, -1.0])
-    angle = float(np.arctan2(sine, axis[2]))
-    return np.asarray(Rotation.from_rotvec(angle * cross / sine).as_matrix())
+        return turned
+    angle = float(np.arctan2(sine, up[2]))
+    return np.asarray(Rotation.from_rotvec(angle * cross / sine).as_matrix() @ turned)
 
 
 def _mount_yaw(imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion]) -> tuple[float, str]:

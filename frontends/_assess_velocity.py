@@ -36,6 +36,7 @@ _INS = re.compile(r"(^|[/_])(o?ins|oxts|inspvax?|span)([/_]|$)", re.IGNORECASE)
 EITHER = f"{EAST_AXES}, or {BODY_AXES}"
 _OF_GNSS = re.compile(r"gps|gnss|fix|ublox|novatel|septentrio|antenna|enu", re.IGNORECASE)
 _FEWEST = 20
+_FAR_WORSE = 5.0  # times the sigma that most fixes claim
 _ASTERN, _MOVES_MPS = 0.95, 0.3
 _REVERSED = "it goes astern nearly all the time: its sign looks wrong, and is taken for reversed"
 
@@ -248,8 +249,16 @@ def motions_of(
         )
         if motion is not None and float(np.percentile(np.abs(motion.speed_mps), 90)) > 0.5:
             (found if report.mount is None or log is not None else logs).append(motion)
-    ways = [(s, *track(s)[:2]) for s in fixes]
+    ways = [(s, *_as_good_as_most(*track(s))) for s in fixes]
     return found + [m for s, at, p in ways if (m := motion_of_places(s.topic, at, p))] or logs
+
+
+def _as_good_as_most(stamps_ns: NDArray[np.int64], p_m: Array, rows: Array) -> tuple[NDArray[np.int64], Array]:
+    """Return stamps (N,) and places (N, 3) without those that claim to be far worse than most: floats beside RTK hide what a craft does."""
+    claimed = np.sqrt(np.maximum(rows[:, 5:7].max(axis=1, initial=0.0), 0.0))
+    usual = float(np.median(claimed)) if len(claimed) else 0.0
+    good = claimed <= _FAR_WORSE * usual if np.isfinite(usual) and usual > 0.0 else np.ones(len(claimed), dtype=bool)
+    return stamps_ns[good], p_m[good]
 
 
 def _told(stream: TopicData, axes: str, R_body_sensor: Array | None = None) -> MeasuredMotion | None:

@@ -66,7 +66,7 @@ def draft_config(inspection: Inspection) -> str:
         _datum_line(inspection),
         "sensors:" if inspection.usable else "sensors: {}  # nothing in this bag can be used",
     ]
-    blocks = [with_clock(block, inspection) for block in _blocks(inspection)]
+    blocks = [with_clock(_in_body(block, inspection), inspection) for block in _blocks(inspection)]
     lines += [f"  {line}" for block in blocks for line in block]
     lines += _beside(inspection.odometry)
     return "\n".join(lines) + "\n"
@@ -124,6 +124,24 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     if fixes or poses or lidars:
         alone = "" if fixes else "; nothing else tells the height, unless z of a pose is used (axes)"
         yield ["height:", f"  enabled: false  # guess: true for a vessel that floats{alone}"]
+
+
+def _in_body(block: list[str], inspection: Inspection) -> list[str]:
+    """Return the block with its mounts from tf as numbers, where the body of tf has its axes ahead, to starboard, down."""
+
+    def numbers(line: str) -> str:
+        head, found, rest = line.partition("mount: {tf_frame: ")
+        frame, brace, _ = rest.partition("}")
+        if not found or not brace or json.loads(frame) not in inspection.in_body:
+            return line
+        xyz, rpy = (
+            ", ".join(f"{round(x, n) + 0.0:.{n}f}" for x in v)
+            for v, n in zip(inspection.in_body[json.loads(frame)], (3, 1), strict=True)
+        )
+        said = f"{json.loads(frame)} of tf, whose body looks ahead, to starboard, down, by gravity and the antennas below it: turned"
+        return f"{head}mount: {{xyz_m: [{xyz}], rpy_deg: [{rpy}]}}  # guess: {said}"
+
+    return [numbers(line) for line in block] if inspection.in_body else block
 
 
 def _in_a_grid(inspection: Inspection) -> list[OdometryReport]:

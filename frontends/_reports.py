@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
 from graphloc.config import SlowErrorConfig
@@ -266,7 +267,10 @@ class MountedTopic:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
-    """All of it."""
+    """All of it.
+
+    `in_body`: places (m) and rpy (deg) of frames in body, where tf has its body's axes ahead, to starboard, down.
+    """
 
     source: str
     topics: tuple[TopicReport, ...]
@@ -279,6 +283,7 @@ class Inspection:
     cameras: tuple[MountedTopic, ...] = ()
     tf_frames: tuple[str, ...] = ()
     body_frame: str = "base_link"
+    in_body: Mapping[str, tuple[Vec, Vec]] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 
     @property

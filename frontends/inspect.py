@@ -114,6 +114,8 @@ _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visua
 _DERIVED = re.compile(r"filter|crop|voxel|sampl|ground|cluster|segment|obstacle|register|skew|second", re.IGNORECASE)
 _NO_LIDAR = re.compile(r"depth|radar|stereo", re.IGNORECASE)
 _LOOKS_AHEAD_DEG = np.array([-90.0, 0.0, -90.0])  # of an optical frame
+_DOWN = np.diag([1.0, -1.0, -1.0])  # to axes ahead, to port, up from such ahead, to starboard, down
+_BELOW_M, _ALIKE = 0.05, 0.9  # antennas in tf, from which its z points down; cosine between axes taken for the same
 _SKY = 0.7  # upward part of an optical axis, from which no tag is seen
 _MOST_NAMED = 6
 _FAR_BEYOND = 3.0  # times as far as another one's height wanders
@@ -202,6 +204,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     courses = courses_of(reference.stamps_ns, reference.p_m, reference.scatter_m) if known else None
     imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, motions, courses, tree, body))]
     imus.sort(key=lambda i: (bool(i.missing), i.gravity == "removed", i.gyro_noise_mdps))
+    down = _looks_down(bag, imus, gnss)
+    imus = [_in_turned_body(imu) for imu in imus] if down else imus
     felt = felt_of(bag.aligned[imus[0].topic], imus[0], tree, body) if imus else None
     late = {motion.source: motion_time_offset(felt, motion) for motion in motions} if felt else {}
     compasses = _compass_reports(bag, imus, felt.turning if felt else None, courses)
@@ -224,6 +228,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         cameras=_cameras(bag),
         tf_frames=tree.frames,
         body_frame=body,
+        in_body={frame: _turned(pose) for frame in tree.frames if (pose := tree.resolve(body, frame))} if down else {},
         warnings=(
             *bag.warnings,
             *(said for report in gnss for said in (report.stored, report.frozen) if said),
@@ -493,6 +498,35 @@ def _at_the_time_of(fixes: MeasuredMotion, velocity: MeasuredMotion) -> Measured
 def _clearly(offset: MotionOffset | None) -> tuple[float, float] | None:
     """Return an offset that is clear, s, and its sigma."""
     return (offset.value_s, offset.sigma_s) if offset is not None and offset.clear else None
+
+
+def _looks_down(bag: _Contents, imus: Sequence[ImuReport], gnss: Sequence[GnssReport]) -> bool:
+    """Return whether the body of tf has its axes ahead, to starboard, down, as makers of INSs have: x and z of the IMU and the antennas say so.
+
+    A driver with such axes of its own, under the frame of a URDF, has its antennas above.
+    """
+    if not imus or imus[0].mount.tf_frame is not None or imus[0].mount.xyz_m is None:
+        return False
+    own = bag.aligned[imus[0].topic]
+    pose = bag.tf_pose(own)
+    # What an INS says of its own place is no antenna.
+    antennas = {g.tf_frame for g in gnss if g.tf_frame not in (None, own.frame_id) and not filtered(g.topic)}
+    places = [mount[0] for frame in antennas if frame and (mount := bag.tree.resolve(bag.tree.body(), frame))]
+    if pose is None or pose[0][2] > 0.0 or not places or any(place[2] > -_BELOW_M for place in places):
+        return False
+    turn = rotation_from_rpy_deg(np.array(imus[0].mount.rpy_deg)) @ pose[1].T
+    return float(np.diagonal(turn @ _DOWN).min()) > _ALIKE
+
+
+def _turned(pose: Pose) -> tuple[Vec, Vec]:
+    """Return a place (m) and rpy (deg) ahead, to port, up of a pose in axes ahead, to starboard, down."""
+    return vec(_DOWN @ pose[0]), vec(np.degrees(rpy_from_rotation(_DOWN @ pose[1])))
+
+
+def _in_turned_body(imu: ImuReport) -> ImuReport:
+    """Return the report with the place of the IMU ahead, to port, up; `_draft` turns what is drafted from tf."""
+    xyz_m = imu.mount.xyz_m
+    return imu if xyz_m is None else replace(imu, mount=replace(imu.mount, xyz_m=vec(_DOWN @ np.array(xyz_m) + 0.0)))
 
 
 def _mounted(bag: _Contents, firsts: Mapping[str, _First]) -> tuple[MountedTopic, ...]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from graphloc import factors
 from graphloc.config import (
@@ -29,8 +30,8 @@ from tests.test_inspect import DATUM, ROLL_90, G, drive, look, rotation_z
 WAVE_S, WAVE_RAD = 3.0, 0.03
 
 
-def boat(make: Messages, yaw_deg: float) -> list[Item]:
-    """At 1.2 m/s in waves, turning to and fro; an IMU at 50 Hz turned by `yaw_deg`, fixes at 5 Hz that scatter by 0.3 m.
+def boat(make: Messages, yaw_deg: float, scatter_m: float = 0.3) -> list[Item]:
+    """At 1.2 m/s in waves, turning to and fro; an IMU at 50 Hz turned by `yaw_deg`, fixes at 5 Hz that scatter by `scatter_m`.
 
     Waves of 0.03 rad put 0.3 m/s^2 of gravity into the horizontal accelerations; the turns are worth 0.12 m/s^2.
     """
@@ -46,7 +47,7 @@ def boat(make: Messages, yaw_deg: float) -> list[Item]:
     gyro = np.column_stack([0 * t, 0 * t, rate])
     accel += np.array([0.0, 0.0, 9.81]) + rng.normal(0, 0.02, accel.shape)
     gyro += rng.normal(0, 1e-3, gyro.shape)
-    places = np.column_stack([way.real, way.imag, 0 * t]) + 0.3 * rng.normal(size=(len(t), 3))
+    places = np.column_stack([way.real, way.imag, 0 * t]) + scatter_m * rng.normal(size=(len(t), 3))
     lla, R = DATUM.geodetic_from_enu(places), rotation_z(yaw_deg)
     items: list[Item] = []
     for k in range(len(t)):
@@ -96,6 +97,34 @@ def test_fixes_of_a_slow_craft_in_waves_tell_the_yaw_of_its_imu(yaw_deg: float, 
     mount = found.imus[0].mount
     assert "yaw by the motion of /fix" in mount.evidence
     assert abs((mount.rpy_deg[2] - yaw_deg + 180.0) % 360.0 - 180.0) < 0.5
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 25.0, -25.0])
+def test_a_tilted_imu_on_its_head_looks_ahead_where_no_motion_tells(tilt_deg: float, tmp_path: Path) -> None:
+    """As one that is not tilted does; levelled the shortest way, its x was drafted astern."""
+    make = Messages(2)
+    R = Rotation.from_euler("yx", [tilt_deg, 180.0], degrees=True).as_matrix()
+    at = [START_NS + k * S // 50 for k in range(500)]
+    items: list[Item] = [
+        ("/imu", ns, make.imu(ns, (R.T @ [0.01 * (k % 3), 0.0, 9.81]).tolist())) for k, ns in enumerate(at)
+    ]
+    items.append(("/fix", at[-1], make.fix(at[-1])))
+    _, config, _ = look(tmp_path, items, make)
+    np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, R, atol=0.01)
+
+
+def test_floats_beside_rtk_do_not_hide_the_yaw_of_an_imu(tmp_path: Path) -> None:
+    """They wander by metres, as they claim; 0 was drafted of an IMU that looks astern."""
+    rng, make = np.random.default_rng(5), Messages(2)
+    items = boat(make, 180.0, 0.02)
+    fixes = [m for topic, _, m in items if topic == "/fix"]
+    wander = np.cumsum(rng.normal(size=(len(fixes), 2)), axis=0) * 2e-5
+    for k, m in enumerate(fixes):
+        off = wander[k] if k > 0.7 * len(fixes) else (0.0, 0.0)
+        m.latitude, m.longitude = m.latitude + off[0], m.longitude + off[1]
+        m.position_covariance[[0, 4, 8]] = 4.0 if k > 0.7 * len(fixes) else 4e-4
+    found, _, _ = look(tmp_path, items, make)
+    assert found.imus[0].mount.rpy_deg[2] == pytest.approx(180.0, abs=0.5)
 
 
 @pytest.mark.parametrize(("seconds", "yaw_deg"), [(60, 0.0), (90, 90.0), (200, 90.0)])
@@ -149,6 +178,31 @@ def test_axes_that_tf_static_does_not_know_are_drafted_as_measured(axes: str, tm
     np.testing.assert_allclose(mount.R_body_sensor, AXES[axes], atol=0.02)
     assert mount.xyz_m == (0.3, 0.1, 0.4)
     assert "guess: not as in tf" in text
+
+
+@pytest.mark.parametrize(("height_m", "above_m"), [(-0.7, 0.7), (0.7, None)])
+@pytest.mark.parametrize("base", [True, False])
+def test_antennas_in_a_tf_that_looks_down_are_drafted_above(
+    height_m: float, above_m: float | None, base: bool, tmp_path: Path
+) -> None:
+    """An INS's own axes as the body's: an antenna half a metre to port was drafted to starboard and below, and the track 1 m off."""
+    make = Messages(2)
+    edges = [("imu_link", "gps", (-0.8, -0.5, height_m), (0, 0, 0, 1))]
+    edges += [("base_link", "imu_link", (0.2, 0.1, -0.3), (0, 0, 0, 1))] if base else []
+    items = [("/tf_static", START_NS, make.transforms(edges)), *drive(make, AXES["upside down"])]
+    fixes = [(at, m) for topic, at, m in items if topic == "/fix"]
+    ins = [make.fix(at, m.latitude, m.longitude, m.altitude, frame="imu_link") for at, m in fixes]
+    items += [("/ekf/fix", at, m) for (at, _), m in zip(fixes, ins, strict=True)]
+    _, config, text = look(tmp_path, items, make)
+    gnss, imu = config.sensors["gnss"].mount, config.sensors["imu"].mount
+    np.testing.assert_allclose(imu.R_body_sensor, AXES["upside down"], atol=0.02)
+    if above_m is None:  # axes of the driver, under the frame of a URDF
+        assert gnss.tf_frame == "gps"
+        assert imu.xyz_m == ((0.2, 0.1, -0.3) if base else (0.0, 0.0, 0.0))
+    else:
+        assert gnss.xyz_m == pytest.approx((-0.6, 0.4, 1.0) if base else (-0.8, 0.5, 0.7))
+        assert imu.xyz_m == pytest.approx((0.2, -0.1, 0.3) if base else (0.0, 0.0, 0.0))
+        assert "whose body looks ahead, to starboard, down" in text
 
 
 @pytest.mark.parametrize("turned_deg", [0.0, 90.0])

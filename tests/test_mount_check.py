@@ -62,6 +62,30 @@ def test_a_heading_that_spins_blames_no_mount_by_number(run: SimulatedRun) -> No
     assert "instead of" not in line
 
 
+def slowed(run: SimulatedRun, speed_mps: float) -> Trajectory:
+    """The track on its back to front, at another speed."""
+    v = np.asarray(run.truth.v_world_mps)
+    return replace(
+        turned(run.truth, "z", 180.0), v_world_mps=speed_mps * v / np.maximum(np.linalg.norm(v, axis=1), 1e-6)[:, None]
+    )
+
+
+def test_a_robot_that_seems_to_go_astern_is_reported(run: SimulatedRun) -> None:
+    """At 0.8 m/s nothing was judged: the heading of one was 179 deg off, 'known' to 10 deg, and no word."""
+    (line,) = map(str, mount_doubts(slowed(run, 0.8), run.recording, run.config))
+    assert "made above 0.3 m/s" in line
+    assert "instead of 90" in line
+
+
+def test_a_slow_vessel_that_a_current_sets_is_not_reported(run: SimulatedRun) -> None:
+    """The same way in the world wherever she heads; or she lies across it all the while."""
+    track = slowed(run, 0.8)
+    east = np.tile([0.8, 0.0, 0.0], (len(track), 1))
+    across = np.tile(Rotation.from_euler("z", 90.0, degrees=True).as_matrix(), (len(track), 1, 1))
+    for set_so in (replace(track, v_world_mps=east), replace(track, v_world_mps=east, R_world_body=across)):
+        assert mount_doubts(set_so, run.recording, run.config) == []
+
+
 def test_a_track_that_lies_still_says_nothing(run: SimulatedRun) -> None:
     still = replace(turned(run.truth, "z", 180.0), v_world_mps=0.1 * np.asarray(run.truth.v_world_mps))
     assert mount_doubts(still, run.recording, run.config) == []

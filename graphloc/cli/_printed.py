@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from graphloc.ledger import Ledger, Outcome
+from graphloc.thinning import THINNED
+
 if TYPE_CHECKING:  # these load gtsam and more, which would delay --help
     from graphloc.app import Run
     from graphloc.eval.report import ReportData
@@ -57,5 +60,14 @@ def _as_text(run: Run, data: ReportData) -> Iterator[str]:
     for track in report.verdict(data).tracks:
         yield f"{track.name}: {track.trust.said}. {track.accuracy}"
         yield from (f"  {reason.text}" for reason in track.reasons if reason.trust is not report.Trust.YES)
-    for name, counts in run.solution.ledger.counts().items():
-        yield f"  {name}: " + ", ".join(f"{n} {outcome}" for outcome, n in counts.items())
+    yield from counted(run.solution.ledger)
+
+
+def counted(ledger: Ledger) -> Iterator[str]:
+    """Yield a line per sensor (or topic): messages by outcome, those apart that were only too close together, which is no fault."""
+    close = {name: n for (name, _, reason), n in ledger.reasons().items() if reason == THINNED}
+    for name, counts in ledger.counts().items():
+        apart = f" ({close[name]} of them only as too close to the one before)" if name in close else ""
+        yield f"  {name}: " + ", ".join(
+            f"{n} {outcome}{apart if outcome == Outcome.REJECTED else ''}" for outcome, n in counts.items()
+        )
