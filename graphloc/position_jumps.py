@@ -30,9 +30,10 @@ _SIGMAS, _BRAKES_MPS2 = 10.0, 10.0  # stated sigmas; emergency braking of a car 
 _EVEN = 1.5  # steps in time that differ by more than this factor are not compared
 _IN_BOUNDS = 1.5  # sigmas of the slow error that the bounds include: jumps up to there need no word
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
-# Off a track: fixes on either side of a jump are compared for so long, and at least so many; by how many sigmas of that they differ, and by
-# how much at least; what share of it comes from one fix to the next, as where track and fixes part otherwise they do so little by little.
-_BESIDE_S, _FEWEST_BESIDE, _OFF_SIGMAS, _OFF_M, _AT_ONCE = 2.0, 3, 8.0, 1.0, 0.5
+# Off a track: fixes on either side of a jump are compared for so long, and at least so many, as two outliers in a row are no jump; by how
+# many sigmas of that they differ, and by how much at least; what share of it comes from one fix to the next, as where track and fixes part
+# otherwise they do so little by little.
+_BESIDE_S, _FEWEST_BESIDE, _OFF_SIGMAS, _OFF_M, _AT_ONCE = 2.0, 5, 8.0, 1.0, 0.5
 _GAP = 3.0  # times the usual time between fixes
 _KEPT = 200
 _FITS_SIGMAS, _CERTAIN_SIGMAS = 5.0, 8.0  # off a prediction

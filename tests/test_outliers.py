@@ -11,7 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from graphloc import app, keys
+from graphloc.build import Problem, Stream, jumping, make_problem
 from graphloc.config import KernelConfig, SlowErrorConfig, VesselConfig
+from graphloc.errors import SolveError
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
@@ -32,8 +34,10 @@ from graphloc.recording import Recording
 from graphloc.replay import arrivals, replay
 from graphloc.solution import Health, Solution
 from graphloc.solve import _batch, _grow
+from graphloc.solve._batch import _first_solution
 from graphloc.solve._decide import Stage, _by_kernel, weigh
 from graphloc.solve._grow import grow
+from graphloc.solve._jumps import with_jumps_off_track
 from graphloc.solve._stretch import StretchStep, solve_stretch
 from tests.slowly import simulate_slowly, with_few_states
 
@@ -527,12 +531,97 @@ def test_what_a_track_leaves_of_its_fixes_shows_jumps_and_neither_outliers_nor_b
     bent = 3.0 * np.tanh((t - 60.0) / 4.0)
     assert seen() == seen(bent) == []
     assert seen(20.0 * (np.arange(len(t)) % 7 == 3)) == []
+    pairs = np.where(np.isin(np.arange(len(t)) % 13, (3, 4)), 20.0, 0.0)
+    assert seen(pairs) == []  # at 1 Hz they were jumps: a run 0.2 m off was 0.8 m off
     # The track follows within seconds, and is off by half of the jump on either side.
     jump = np.where(t < 60.0, -1.0, 1.0) * 4.0 * np.exp(-np.abs(t - 60.0) / 8.0)
     ((at_s, size_m),) = seen(jump)
     assert at_s == pytest.approx(60.0)
     assert 4.0 < size_m < 9.0
     assert seen(jump, (t < 59.0 - 5.0 / hz) | (t >= 60.0)) == []  # over a gap anything may have moved
+
+
+def lone_problem(slow: SlowErrorConfig | None = None) -> Problem:
+    """A short run of one receiver, IMU and compass, ready to be solved."""
+    _, recording, config = jumping_alone(5.0, (0.0, 0.0), 12.0, slow=slow)
+    datum = app.choose_datum(recording, config)
+    return make_problem(app.with_synthetic(recording, config, datum), config, datum, SENSORS, INERTIAL)
+
+
+def receiver_of(problem: Problem) -> Stream:
+    return next(stream for stream in problem.streams if stream.row.absolute)
+
+
+def off_at(problem: Problem, *jumps_s: float) -> Any:
+    """Verdicts by which the track follows jumps of 8 m, and is off by half of that on either side, within seconds."""
+    stream = receiver_of(problem)
+    t = np.array([m.stamp_ns - stream.measurements[0].stamp_ns for m in stream.measurements]) * 1e-9
+    off_m = sum(np.where(t < at, 4.0, -4.0) * np.exp(-np.abs(t - at) / 4.0) for at in jumps_s)
+    residuals = [SimpleNamespace(raw=np.array([m, 0.0, 0.0])) for m in np.asarray(off_m)]
+    return {(stream.number, i): SimpleNamespace(residual=residual) for i, residual in enumerate(residuals)}
+
+
+def test_a_run_is_solved_again_for_new_jumps_alone() -> None:
+    """One that a solution showed once more was taken in twice, solved for twice, and counted as two."""
+    problem = lone_problem()
+    once = with_jumps_off_track(problem, off_at(problem, 4.1))
+    assert once is not None
+    assert receiver_of(once).left_out is None
+    (at_ns,) = receiver_of(once).position_jumps[0]
+    assert with_jumps_off_track(once, off_at(once, 4.1)) is None
+    twice = with_jumps_off_track(once, off_at(once, 4.1, 8.1))
+    assert twice is not None
+    assert receiver_of(twice).position_jumps[0].tolist() == [at_ns, at_ns + 4_000_000_000]
+
+
+def test_a_run_whose_slow_error_is_off_is_not_solved_again_for_jumps() -> None:
+    """With a known one it was, twice, to the same end: the track follows them."""
+    problem = lone_problem(SlowErrorConfig(enabled=False))
+    known = jumping(receiver_of(problem), np.array([receiver_of(problem).measurements[10].stamp_ns]), np.array([8.0]))
+    told = replace(problem, streams=tuple(known if s.row.absolute else s for s in problem.streams))
+    assert with_jumps_off_track(told, off_at(told, 4.1)) is None
+
+
+def test_a_run_that_cannot_be_solved_with_its_jumps_is_solved_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = lone_problem()
+    right = _batch.solve_batch(problem)
+    jumped = with_jumps_off_track(problem, off_at(problem, 4.1))
+    assert jumped is not None
+
+    def only_without(given: Problem, *args: Any, **options: Any) -> Any:
+        if given is jumped:
+            raise SolveError("not with these")
+        return _first_solution(given, *args, **options)
+
+    monkeypatch.setattr(_batch, "with_jumps_off_track", lambda *_: jumped)
+    monkeypatch.setattr(_batch, "_first_solution", only_without)
+    found = _batch.solve_batch(problem)
+    assert found.stated is problem
+    last = keys.pose(len(problem.timeline) - 1)
+    assert found.values.atPose3(last).equals(right.values.atPose3(last), 1e-3)
+
+
+def test_jumps_found_with_noise_that_needs_another_start_are_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The slow error was a state, and counted once more as left out; nothing was said of the jumps."""
+    problem = lone_problem()
+    jumped = with_jumps_off_track(problem, off_at(problem, 4.1))
+    assert jumped is not None
+    seen, noisier = [None, jumped, None], [problem, None]
+
+    def by_motion(*args: Any, **options: Any) -> Any:
+        begun, solved = _first_solution(*args, **options)
+        return begun._replace(start=replace(begun.start, by_motion=True)), solved
+
+    monkeypatch.setattr(_batch, "with_jumps_off_track", lambda *_: seen.pop(0))
+    monkeypatch.setattr(_batch, "with_needed_noise", lambda *_: noisier.pop(0))
+    monkeypatch.setattr(_batch, "_first_solution", by_motion)
+    found = _batch.solve_batch(problem)
+    assert seen == noisier == []
+    for of in (found.problem, found.stated):
+        assert receiver_of(of).slow is not None
+        assert receiver_of(of).left_out is None
+        assert len(receiver_of(of).position_jumps[0]) == 1
+    assert found.stated.config is problem.config
 
 
 @pytest.mark.parametrize("off_m", [10.0, 40.0])

@@ -275,22 +275,18 @@ class States:
                 J[rows, first[at.slow_key] : first[at.slow_key] + width] = residual.slow_jacobian()
         return np.asarray(J @ window.covariance([*poses, *slow]) @ J.T)
 
-    def late_s(self, stream: LiveStream) -> tuple[float, float] | None:
-        """Return how much later than stamped a sensor measures, and the sigma of that, s, where its slow state tells it."""
+    def late_far_off(self, stream: LiveStream) -> list[tuple[str, str]]:
+        """Return `TIME_OFFSET` and a line where the stamps of a sensor, by its slow state, are clearly far from where they are set."""
         if stream.slow is None or (axis := stream.slow.late) is None:
-            return None
+            return []
         key = keys.slow(stream.number, self._problem.timeline.slow_of[self._newest.number])
         if not self._window.is_committed(key):
-            return None
-        var = float(self._window.covariance([key])[axis, axis])
-        return float(self._window.values.atVector(key)[axis]), float(np.sqrt(var))
-
-    def late_far_off(self, stream: LiveStream) -> list[tuple[str, str]]:
-        """Return `TIME_OFFSET` and a line where the stamps of a sensor are clearly far from where they are set."""
-        found = self.late_s(stream)
-        if found is None or abs(found[0]) <= FAR_OFF * found[1]:
             return []
-        return [(TIME_OFFSET, line) for line in late_far_off(stream.name, stream.slow, found[0])]
+        late_s = float(self._window.values.atVector(key)[axis])
+        said = late_far_off(stream.name, stream.slow, late_s)
+        # The sigma is asked for last: it takes time.
+        clear = said and abs(late_s) > FAR_OFF * np.sqrt(self._window.covariance([key])[axis, axis])
+        return [(TIME_OFFSET, line) for line in said] if clear else []
 
     def links(self) -> list[Held]:
         """Return the IMU factors, but for the oldest tenth: the solver cannot relinearise the poses there."""

@@ -49,7 +49,7 @@ from graphloc.solve._decide import AGREES, Stage, Verdicts, agrees, met, weigh
 from graphloc.solve._grow import grow
 from graphloc.solve._imu_mount import MountError, with_mount_estimated
 from graphloc.solve._imu_noise import with_needed_noise
-from graphloc.solve._jumps import with_jumps_off_track
+from graphloc.solve._jumps import with_jumps_of, with_jumps_off_track
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import (
@@ -131,9 +131,15 @@ def solve_batch(
     for _ in range(0 if newest else _MAX_JUMP_ROUNDS):
         if (jumping := with_jumps_off_track(problem, solved.settled.verdicts)) is None:
             break
+        without = begun, solved.choice()
+        del solved  # and its graph, before the next one is made
+        try:
+            begun, solved = _first_solution(jumping, progress, newest=newest, doubt_imu=doubt_imu)
+        except SolveError:
+            begun, choice = without
+            solved = choice.settled_again(begun.prior, progress)
+            break
         problem = jumping
-        del solved
-        begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu)
     stated = problem
     mount = None
     if not newest:
@@ -155,7 +161,7 @@ def solve_batch(
         if begun.start.by_motion and ratio < CONTRADICTION:
             # Which headings the motion excludes was found with the smaller noise.
             again = solve_batch(replace(noisier, usual_motion=None), progress, newest=newest)
-            return replace(again, stated=stated)
+            return replace(again, stated=with_jumps_of(again.stated, stated))
         problem = bridged(noisier, estimate)
         if ratio >= CONTRADICTION:
             estimate, used, passed = rough_passes(

@@ -23,13 +23,25 @@ def with_jumps_off_track(problem: Problem, verdicts: Verdicts) -> Problem | None
     if len(absolute) != 1 or absolute[0].row.false is not None:
         return None
     (stream,) = absolute
-    if stream.left_out is None and not len(stream.position_jumps[0]):
-        return None  # its error is estimated all the time, or is not to be
+    known_ns, _ = stream.position_jumps
+    if stream.left_out is None and (stream.slow is None or not len(known_ns)):
+        return None  # its error is not to be estimated, or is all the time
     raw = np.array([verdicts[stream.number, i].residual.raw[:2] for i in range(len(stream.measurements))])
-    seen = jumps_off_track(
+    at_ns, size_m = jumps_off_track(
         stamps_of(stream.measurements), -raw.reshape(-1, 2), allowed_m=allowed_jump_m(stream.left_out or stream.slow)
     )
-    if not len(seen[0]):
+    new = ~np.isin(at_ns, known_ns)  # where one is known already, another solution would be the same
+    if not new.any():
         return None
-    told = jumping(stream, *seen)
+    told = jumping(stream, at_ns[new], size_m[new])
     return replace(problem, streams=tuple(told if s is stream else s for s in problem.streams))
+
+
+def with_jumps_of(solved: Problem, problem: Problem) -> Problem:
+    """Return a problem with the position jumps, and the slow errors that these make states, with which it was solved."""
+    jumps = ((s.slow, s.left_out, s.position_jumps) for s in solved.streams)
+    streams = (
+        replace(stream, slow=slow, left_out=left_out, position_jumps=found)
+        for stream, (slow, left_out, found) in zip(problem.streams, jumps, strict=True)
+    )
+    return replace(problem, streams=tuple(streams))
