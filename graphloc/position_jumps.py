@@ -30,10 +30,10 @@ _SIGMAS, _BRAKES_MPS2 = 10.0, 10.0  # stated sigmas; emergency braking of a car 
 _EVEN = 1.5  # steps in time that differ by more than this factor are not compared
 _IN_BOUNDS = 1.5  # sigmas of the slow error that the bounds include: jumps up to there need no word
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
-# Off a track: fixes on either side of a jump are compared for so long, and at least so many, as two outliers in a row are no jump; by how
-# many sigmas of that they differ, and by how much at least; what share of it comes from one fix to the next, as where track and fixes part
-# otherwise they do so little by little.
-_BESIDE_S, _FEWEST_BESIDE, _OFF_SIGMAS, _OFF_M, _AT_ONCE = 2.0, 5, 8.0, 1.0, 0.5
+# Off a track: fixes on either side of a jump are compared for so long, and at least so many, of which as many lie on their side, as two
+# outliers in a row are no jump; by how many sigmas of that they differ, and by how much at least; what share of it comes from one fix to the
+# next, as where track and fixes part otherwise they do so little by little.
+_BESIDE_S, _FEWEST_BESIDE, _OFF_SIGMAS, _OFF_M, _AT_ONCE = 2.0, 3, 8.0, 1.0, 0.5
 _GAP = 3.0  # times the usual time between fixes
 _KEPT = 200
 _FITS_SIGMAS, _CERTAIN_SIGMAS = 5.0, 8.0  # off a prediction
@@ -108,15 +108,24 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
     if len(off_m) < max(2 * n, _FEWEST):
         return np.zeros(0, dtype=np.int64), np.zeros(0)
     steps = np.diff(off_m, axis=0)
-    medians = np.median(np.lib.stride_tricks.sliding_window_view(off_m, n, axis=0), axis=-1)
-    change = medians[n:] - medians[:-n]  # about each step that has n fixes on either side
+    windows = np.lib.stride_tricks.sliding_window_view(off_m, n, axis=0)
+    medians = np.median(windows, axis=-1)
+    change, between = (
+        medians[n:] - medians[:-n],
+        (medians[n:] + medians[:-n]) / 2.0,
+    )  # about each step that has n fixes on either side
     size_m, inner = np.linalg.norm(change, axis=1), slice(n - 1, n - 1 + len(change))
+    after, before = (
+        (np.einsum("kin,ki->kn", own - between[:, :, None], change) * way > 0.0).sum(axis=1)
+        for own, way in ((windows[n:], 1.0), (windows[:-n], -1.0))
+    )
     # Standard deviations on one axis: of a fix, by the steps' median length; of a difference of medians.
     sigma_m = float(np.median(np.linalg.norm(steps, axis=1))) / np.sqrt(4.0 * np.log(2.0))
     least_m = max(_OFF_M, allowed_m, _OFF_SIGMAS * sigma_m * np.sqrt(np.pi / n))
     along_m = np.einsum("ni,ni->n", steps[inner], change) / np.maximum(size_m, 1e-9)
     # Over a gap the track bends, too, where the IMU is worse than it is taken for.
     jumps = (size_m > least_m) & (along_m > _AT_ONCE * size_m) & (dt_s[inner] < _GAP * usual_s)
+    jumps &= np.minimum(after, before) >= _FEWEST_BESIDE
     left_m, found = np.where(jumps, size_m, 0.0), list[int]()
     while left_m.max() > 0.0:
         found.append(int(np.argmax(left_m)))
