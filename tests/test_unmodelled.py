@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from graphloc import app
+from graphloc.blocks import MountConfig
 from graphloc.config import GnssConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
@@ -101,6 +102,24 @@ def test_a_drift_does_not_turn_the_heading_against_the_compass(monkeypatch: pyte
     assert rms(off_deg(followed)[inside]) > 2.0 * rms(off_deg(taken_back)[inside])
     assert np.abs(off_deg(taken_back) - off_deg(as_state))[inside].max() < 0.2
     antenna = [track.p_world_m + track.R_world_body @ lever_m for track in (taken_back, followed)]
+    assert np.abs(antenna[0] - antenna[1]).max() < 1e-6
+
+
+def test_an_antenna_of_unknown_place_stays_where_it_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was held where it is configured, so the one found moved as the heading was turned back."""
+    _, recording, config = drifting(1, 2.0, compass_hz=5.0)
+    gnss = config.sensors["gnss"]
+    lever_m = gnss.mount.t_body_sensor_m - [2.0, 1.0, 0.0]
+    elsewhere = {"mount": MountConfig(xyz_m=tuple(lever_m)), "mount_sigma_m": 2.0}
+    config = with_few_states(config.with_sensors({"gnss": gnss.model_copy(update=elsewhere)}), 2.0)
+    antenna, heading = [], []
+    for _ in range(2):
+        solution = app.smooth_recording(recording, config).solution
+        track = solution.trajectory
+        antenna.append(track.p_world_m + track.R_world_body @ (lever_m + solution.antennas_off_m["gnss"]))
+        heading.append(track.yaw_rad)
+        monkeypatch.setattr(_solution, "with_drift_taken_back", lambda result: result)
+    assert np.abs(heading[0] - heading[1]).max() > np.radians(0.3)
     assert np.abs(antenna[0] - antenna[1]).max() < 1e-6
 
 

@@ -17,8 +17,9 @@ import numpy as np
 from scipy.sparse import diags_array
 
 from graphloc import keys
-from graphloc.build import Problem
+from graphloc.build import Problem, solved_constants
 from graphloc.frames import Array
+from graphloc.graph import antenna_off_m, corrections
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._linearised import linearised, normal_solver, root_weights, with_left_out
 
@@ -48,7 +49,9 @@ def with_drift_taken_back(result: BatchResult) -> BatchResult:
     if np.linalg.norm(turned, axis=1).max() > _LINEAR_RAD:
         return result
     faster = dx[rows.first_velocity : rows.first_pose].reshape(-1, 3)
-    moved, antenna = gtsam.Values(values), followed.mount.translation()
+    moved, antenna = gtsam.Values(values), np.asarray(followed.mount.translation())
+    if (off_m := antenna_off_m(corrections(solved_constants(followed, values), followed.mount))) is not None:
+        antenna = antenna + off_m
     for k, (turn, dv) in enumerate(zip(turned, faster, strict=True)):
         pose = values.atPose3(keys.pose(k))
         R = pose.rotation().compose(gtsam.Rot3.Expmap(turn))
