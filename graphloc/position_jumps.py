@@ -3,8 +3,8 @@
 
 The stated sigma does not show them: a wrong RTK fix is stated to a centimetre as a right one is. They are found in the
 positions themselves, by comparing each step with those before and after it: no vessel changes its acceleration by so much
-at once. Offline those are found, too, that stand out less, or whose fixes are far apart: the IMU keeps a track from following at
-once, so the fixes are off to one side of it before a jump, and to the other one after it.
+at once. Offline those that stand out less are found, too: the IMU keeps a track from following at once, so the fixes are off to one side of
+it before a jump, and to the other one after it.
 """
 
 from __future__ import annotations
@@ -110,10 +110,8 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
     steps = np.diff(off_m, axis=0)
     windows = np.lib.stride_tricks.sliding_window_view(off_m, n, axis=0)
     medians = np.median(windows, axis=-1)
-    change, between = (
-        medians[n:] - medians[:-n],
-        (medians[n:] + medians[:-n]) / 2.0,
-    )  # about each step that has n fixes on either side
+    # About each step that has n fixes on either side.
+    change, between = medians[n:] - medians[:-n], (medians[n:] + medians[:-n]) / 2.0
     size_m, inner = np.linalg.norm(change, axis=1), slice(n - 1, n - 1 + len(change))
     after, before = (
         (np.einsum("kin,ki->kn", own - between[:, :, None], change) * way > 0.0).sum(axis=1)
