@@ -14,14 +14,13 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from scipy.sparse import diags_array
 
 from graphloc import keys
 from graphloc.build import Problem, solved_constants
 from graphloc.frames import Array
 from graphloc.graph import antenna_off_m, corrections
 from graphloc.solve._batch import BatchResult
-from graphloc.solve._linearised import linearised, normal_solver, root_weights, with_left_out
+from graphloc.solve._linearised import linearised, normal_solver, with_left_out
 
 _LINEAR_RAD = np.radians(15.0)  # a turn up to which the linearised run holds
 
@@ -40,9 +39,8 @@ def with_drift_taken_back(result: BatchResult) -> BatchResult:
         return result
     full, there = with_left_out(problem, values)
     rows = linearised(full, there, result.verdicts, result.prior)
-    root = root_weights(rows, -rows.b)
-    J = diags_array(root) @ rows.J
-    dx = normal_solver(J)(J.T @ (root * rows.b))
+    _, J, b = rows.weighed()
+    dx = normal_solver(J)(J.T @ b)
     if not np.isfinite(dx).all():
         raise RuntimeError("not finite")
     turned = dx[rows.first_pose :].reshape(-1, 6)[:, :3]

@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
-from scipy.sparse import diags_array
 
 from graphloc import keys
 from graphloc.build import Problem, StartPrior, with_imu_turned
@@ -31,7 +30,7 @@ from graphloc.errors import SolveError
 from graphloc.frames import Array, skew
 from graphloc.recording import Progress
 from graphloc.solve._decide import Stage, Verdicts, weigh
-from graphloc.solve._linearised import linearised, normal_solver, root_weights, sparse_rows, with_left_out
+from graphloc.solve._linearised import linearised, normal_solver, sparse_rows, with_left_out
 from graphloc.solve._passes import Settled, cost_as_configured, settle
 
 _ROUNDS = 3
@@ -92,9 +91,8 @@ def mount_error(
     told = follows = _followed(*sparse_rows(graph, values), n)
     if any(stream.left_out is not None for stream in problem.streams):
         # The graph takes their drift for motion, which would speak for a mount as if it were none.
-        rows = linearised(*with_left_out(problem, values), verdicts, prior)
-        root = root_weights(rows, -rows.b)
-        told = _followed(diags_array(root) @ rows.J, root * rows.b, n)
+        _, J, b = linearised(*with_left_out(problem, values), verdicts, prior).weighed()
+        told = _followed(J, b, n)
     cov = np.linalg.inv(told.left.T @ told.left + np.eye(3) / sigma**2)
     turn = cov @ (told.left.T @ told.b - problem.imu_turn_rad / sigma**2)
     X = follows.states
@@ -117,8 +115,7 @@ def followed_before(
         return None
     rows, n = linearised(problem, values, verdicts, prior), len(problem.timeline)
     before = rows.stamps_ns < problem.timeline.stamps_ns[k]
-    J, c = diags_array(root_weights(rows, -rows.b)) @ rows.J, by_turn(rows.J, n)
-    J, c = J[before], c[before]
+    J, c = rows.weighed().J[before], by_turn(rows.J, n)[before]
     used = abs(J).sum(axis=0) > 0.0
     X = np.zeros((len(used), 3))
     X[used] = -normal_solver(J[:, used])(J[:, used].T @ c)

@@ -22,7 +22,7 @@ from graphloc.imu_scatter import noise_density
 from graphloc.measurements import ImuSeries
 from graphloc.offsets import Misfit
 from graphloc.solve._decide import Verdicts
-from graphloc.solve._linearised import linearised, normal_solver, normal_solver_and_log_det, root_weights
+from graphloc.solve._linearised import linearised, normal_solver, normal_solver_and_log_det
 
 Solved = tuple[Any, Array, Callable[[Array], Array]]
 """J, weighted; residuals (rows,); and the solution of J'J x = y."""
@@ -128,11 +128,10 @@ def with_needed_noise(problem: Problem, values: gtsam.Values, verdicts: Verdicts
     if (most < LEAST_TIMES).all():
         return None
     rows = linearised(problem, values, verdicts, prior)
-    root = root_weights(rows, -rows.b)
-    J = diags_array(root) @ rows.J
+    root, J, b = rows.weighed()
     try:
         solve = normal_solver(J)
-        solved = J, root * rows.b - J @ solve(J.T @ (root * rows.b)), solve
+        solved = J, b - J @ solve(J.T @ b), solve
         found = imu_misfit(rows.J, root, rows.b, solved, rows.states - 1, most.tolist())
     except RuntimeError:  # not determined by normal equations; the solution stands
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -21,6 +21,14 @@ from graphloc.graph import Attachment, Decision
 from graphloc.solve._decide import Verdicts
 
 _LEAST_WEIGHT = 1e-6
+
+
+class Weighed(NamedTuple):
+    """A linear system J dx = b (rows, columns), (rows,) by its losses, and the root of the weight of each row (rows,)."""
+
+    root: Array
+    J: Any
+    b: Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,6 +48,15 @@ class Rows:
     stamps_ns: NDArray[np.int64]
     made: Made
     kernels: list[tuple[range, KernelConfig]]
+
+    def weighed(self, misfit: Array | None = None) -> Weighed:
+        """Return the system with the weights that the losses give the rows at a misfit (rows,); by default at that of the estimate, -b."""
+        misfit = -self.b if misfit is None else misfit
+        total, root = np.concatenate([[0.0], np.cumsum(misfit**2)]), np.ones(len(misfit))
+        for factors, kernel in self.kernels:
+            a, b = self.starts[factors.start], self.starts[factors.stop]
+            root[a:b] = np.sqrt(max(kernel.weight(float(total[b] - total[a])), _LEAST_WEIGHT))
+        return Weighed(root, diags_array(root) @ self.J, root * self.b)
 
     def used(self, stream: Stream) -> list[int]:
         """Return the indices of the measurements of a stream that have rows."""
@@ -151,15 +168,6 @@ def _stamps_ns(problem: Problem, held: list[Any]) -> NDArray[np.int64]:
     for f in range(len(held) - 1, -1, -1):
         after = stamps[f] = min((at[key] for key in held[f] if key in at), default=after)
     return stamps
-
-
-def root_weights(rows: Rows, misfit: Array) -> Array:
-    """Return the root of the weight of each row, by the losses."""
-    total, root = np.concatenate([[0.0], np.cumsum(misfit**2)]), np.ones(len(misfit))
-    for factors, kernel in rows.kernels:
-        a, b = rows.starts[factors.start], rows.starts[factors.stop]
-        root[a:b] = np.sqrt(max(kernel.weight(float(total[b] - total[a])), _LEAST_WEIGHT))
-    return root
 
 
 def normal_solver(J: Any) -> Callable[[Array], Array]:

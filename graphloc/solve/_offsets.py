@@ -23,7 +23,6 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
-from scipy.sparse import diags_array
 
 from graphloc import keys
 from graphloc.build import Problem, StartPrior, Stream, with_imu_turned
@@ -32,7 +31,7 @@ from graphloc.graph import Constant, SlowProcess
 from graphloc.offsets import Offset, Offsets, Probe
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._imu_noise import imu_misfit
-from graphloc.solve._linearised import Rows, linearised, normal_solver, root_weights, with_left_out
+from graphloc.solve._linearised import Rows, linearised, normal_solver, with_left_out
 
 BLOCK_S = 2.0
 # Rounds of choosing weights; they end early where the weights, or theta (in sigmas), change little.
@@ -61,20 +60,20 @@ def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
         return None
     names, B = list(columns), np.column_stack(list(columns.values()))
     weak = np.array([1.0 / _FREE[what] for _, what in names])
-    fresh = root_weights(rows, -rows.b)
+    fresh = rows.weighed()
     theta = np.zeros(len(names))
     for n in range(_ROUNDS):
-        root, before = fresh, theta
-        J, b, own = diags_array(root) @ rows.J, root * rows.b, root[:, None] * B
+        (root, J, b), before = fresh, theta
+        own = root[:, None] * B
         solve = normal_solver(J)
         left = own - J @ solve(J.T @ own)
         r = b - J @ solve(J.T @ b)
         cov = np.linalg.inv(left.T @ left + np.diag(weak**2))
         theta = cov @ (left.T @ r)
         r_free = r - left @ theta
-        fresh = root_weights(rows, r_free / root)
+        fresh = rows.weighed(r_free / root)
         moved = float((np.abs(theta - before) / np.sqrt(np.diagonal(cov))).max())
-        if moved < _SAME if n else np.abs(fresh**2 - root**2).max() < _SAME_WEIGHT:
+        if moved < _SAME if n else np.abs(fresh.root**2 - root**2).max() < _SAME_WEIGHT:
             break
     gradient, curvature = _in_blocks(rows, left, r)
     gyroscope, accelerometer = imu_misfit(rows.J, root, rows.b - B @ theta, (J, r_free, solve), rows.states - 1)

@@ -14,14 +14,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import diags_array
 
 from graphloc import keys
 from graphloc.build import Stream
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
 from graphloc.solve._batch import BatchResult
-from graphloc.solve._linearised import linearised, normal_solver, root_weights
+from graphloc.solve._linearised import linearised, normal_solver
 from graphloc.time import NS_PER_S
 
 _DRAWS, _AT_ONCE = 64, 16  # a sigma from 64 draws is good to 9 %; so many at once, for memory
@@ -48,8 +47,7 @@ def unmodelled(result: BatchResult) -> Unmodelled | None:
         (stream.left_out, stream, used) for stream in problem.streams
         if stream.left_out is not None and (used := rows.used(stream))  # else all its fixes were rejected
     ]  # fmt: skip
-    root = root_weights(rows, -rows.b)
-    J = diags_array(root) @ rows.J
+    root, J, _ = rows.weighed()
     solve, rng, n = normal_solver(J), np.random.default_rng(0), rows.states
     R = np.array([values.atPose3(keys.pose(k)).rotation().matrix() for k in range(n)])
     found = Unmodelled(np.zeros((n, 3, 3)), np.zeros((n, 3, 3)))
