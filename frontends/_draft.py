@@ -43,9 +43,6 @@ _LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images
 _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _ANTENNA_OFF_M = 1.0  # from the IMU: of a car; 4 m on a boat or 0.3 m on a robot are found with it as well
-# Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
-_RTK_M = (0.05, 0.1)
-_RTK_SCATTER_M = 0.1
 _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off: else a wrong fix draws the track along
 _FILTERED = "by its name, or its messages, a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
 _MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; drivers may publish each packet
@@ -307,7 +304,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         large, said = _slow_error(gnss)
         vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3)
         more = ", ".join([*([f"vertical_sigma_m: {vertical:.1f}"] if wanders else []), *large])
-        fixed = f"; {{{_RTK_SLOW_ERROR}}} where RTK is fixed throughout" if _rtk_lines(gnss) else ""
+        fixed = f"; {{{_RTK_SLOW_ERROR}}} where RTK is fixed throughout" if gnss.rtk_sigma_m else ""
         lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{said}{fixed}")
     return lines
 
@@ -370,25 +367,21 @@ def _rtk_slow_error(gnss: GnssReport) -> str:
 
 
 def _rtk_lines(gnss: GnssReport) -> list[str]:
-    """What is seen of RTK that reports no covariance, which would count as good to metres; NMEA tells it by its quality."""
-    augmented = set(gnss.statuses) - {"no fix"} == {"gbas"}
-    if not augmented or gnss.reported_sigma_m or gnss.scatter_m is None or " " in gnss.topic:
+    """What is seen of RTK that reports no covariance, which would count as good to metres."""
+    if gnss.rtk_sigma_m is None or gnss.scatter_m is None:
         return []
-    seen_m = max(gnss.scatter_m[:2]), gnss.scatter_m[2]
-    if seen_m[0] > _RTK_SCATTER_M:
-        return []
-    horizontal, vertical = (max(least, seen) for least, seen in zip(_RTK_M, seen_m, strict=True))
-    said = f"guess: status gbas (RTK, or DGPS), and consecutive fixes scatter by {seen_m[0]:.3f} m"
+    horizontal, vertical = gnss.rtk_sigma_m
+    said = f"guess: status gbas (RTK, or DGPS), and consecutive fixes scatter by {max(gnss.scatter_m[:2]):.3f} m"
     return [
         f"  default_horizontal_sigma_m: {horizontal:.2f}  # {said}",
-        f"  default_vertical_sigma_m: {vertical:.2f}  # guess: likewise, {seen_m[1]:.3f} m",
+        f"  default_vertical_sigma_m: {vertical:.2f}  # guess: likewise, {gnss.scatter_m[2]:.3f} m",
     ]
 
 
 def _uneven_lines(gnss: GnssReport) -> list[str]:
     """What uneven stamps are off by along the way, where that is more than the fixes are taken for."""
     default = GnssConfig()
-    taken_m = _RTK_M[0] if _rtk_lines(gnss) else default.default_horizontal_sigma_m
+    taken_m = gnss.rtk_sigma_m[0] if gnss.rtk_sigma_m else default.default_horizontal_sigma_m
     if gnss.reported_sigma_m:
         taken_m = max(*gnss.reported_sigma_m[:2], default.min_horizontal_sigma_m)
     if gnss.uneven is None or gnss.uneven.along_m <= taken_m:

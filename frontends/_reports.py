@@ -19,6 +19,9 @@ Vec = tuple[float, float, float]
 _TWO_ANTENNAS = re.compile(r"[ +]G[A-Z](HDT|THS)$|gps|gnss|nav_?heading|rel_?pos|dual|moving_?bas", re.IGNORECASE)
 _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
 _DIFFERS = 1.5  # times the default of a slow error
+# Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
+_RTK_M = (0.05, 0.1)
+_RTK_SCATTER_M = 0.1
 WATER = " (through water)"
 """At the end of the name of a stream of those of a Doppler log's messages that say so."""
 FILTER = " (of a filter)"
@@ -164,6 +167,15 @@ class GnssReport:
     uneven: Uneven | None = None
     apart_m: float = 0.0
     apart_from: str = ""
+
+    @property
+    def rtk_sigma_m(self) -> tuple[float, float] | None:
+        """Horizontal and vertical sigma that its fixes are taken for, m: of RTK that reports no covariance; None for others. NMEA tells it by its quality."""
+        augmented = set(self.statuses) - {"no fix"} == {"gbas"}
+        if not augmented or self.reported_sigma_m or self.scatter_m is None or " " in self.topic:
+            return None
+        seen_m = max(self.scatter_m[:2]), self.scatter_m[2]
+        return None if seen_m[0] > _RTK_SCATTER_M else (max(_RTK_M[0], seen_m[0]), max(_RTK_M[1], seen_m[1]))
 
     @property
     def differs(self) -> bool:

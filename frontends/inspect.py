@@ -289,12 +289,13 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
     rivals = [r for r in found if r.spans_s >= _COVERS * longest_s and not filtered(r.topic)]
     most = max((r.fixes for r in rivals), default=0)
     level_m = min((m for r in rivals if (m := height_wanders_m(r)) is not None), default=0.0)
+    claimed = any(r.reported_sigma_m for r in rivals)
     found.sort(
         key=lambda r: (
             filtered(r.topic),
             r.spans_s < _COVERS * longest_s,
             r.slow_error,
-            _octave(r, level_m if r in rivals else math.inf),
+            _octave(r, level_m if r in rivals else math.inf, claimed=claimed),
             r.fixes < _COVERS * most,
             r.without_height == r.fixes,
             -r.fixes,
@@ -304,18 +305,26 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
     return [_beside_others(report, rivals, bag) for report in found]
 
 
-def _octave(gnss: GnssReport, level_m: float) -> int:
+def _octave(gnss: GnssReport, level_m: float, *, claimed: bool) -> int:
     """Return how large the fixes' error is by what they claim, or scatter or drift by, in powers of two: closer ones are taken for equal.
 
     Args:
         level_m: by how much the heights of that receiver wander whose heights wander least, 1 sigma. All ride on one craft: what others
             wander by far beyond it is their drift, and the horizontal one is half of the vertical. Up to that it may be hills, which
             receivers smooth.
+        claimed: whether one of the receivers claims anything; where none does, their heights alone compare them.
     """
-    claimed = gnss.reported_sigma_m[:2] if gnss.reported_sigma_m else (GnssConfig().default_horizontal_sigma_m,)
-    wanders_m = height_wanders_m(gnss) or 0.0
-    drift_m = 0.5 * wanders_m if wanders_m > _FAR_BEYOND * level_m else 0.0
-    return round(math.log2(max(*claimed, *(gnss.scatter_m or ())[:2], drift_m, 1e-3)))
+    wanders_m = height_wanders_m(gnss)
+    drift_m = 0.5 * wanders_m if wanders_m is not None and wanders_m > _FAR_BEYOND * level_m else 0.0
+    if gnss.reported_sigma_m:
+        taken_m = max(gnss.reported_sigma_m[:2])
+    elif gnss.rtk_sigma_m:
+        taken_m = gnss.rtk_sigma_m[0]
+    elif claimed or wanders_m is None:
+        taken_m = GnssConfig().default_horizontal_sigma_m
+    else:
+        taken_m = 0.5 * wanders_m
+    return round(math.log2(max(taken_m, *(gnss.scatter_m or ())[:2], drift_m, 1e-3)))
 
 
 def _beside_others(gnss: GnssReport, rivals: Sequence[GnssReport], bag: _Contents) -> GnssReport:

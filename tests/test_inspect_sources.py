@@ -441,6 +441,29 @@ def test_of_two_receivers_the_one_whose_height_drifts_is_not_used(tmp_path: Path
     assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == ["/fix"]
 
 
+@pytest.mark.parametrize(("status", "hilly"), [(2, False), (2, True), (0, False)], ids=["RTK", "RTK, hills", "heights"])
+def test_of_receivers_that_claim_nothing_the_better_one_is_used_though_it_loses_fixes(
+    status: int, hilly: bool, tmp_path: Path
+) -> None:
+    """Equal by what they claim, the one with most fixes was used: it drifted by 2 m beside RTK with gaps (NCLT's bags)."""
+    make, unknown = Messages(2), np.zeros(9)
+    items = two_receivers(make, lambda t, yaw: 0.5 * drift(t, yaw), claims_m=1.0, height=True)
+    kept = []
+    for k, (topic, at, m) in enumerate(drive(make, seconds=120, noise_m=0.02)):
+        if topic == "/fix" and (at - START_NS) // S % 30 < 18 and k % 5 == 0:
+            kept.append(("/fix", at, make.fix(at, m.latitude, m.longitude, m.altitude, status, unknown)))
+    for topic, at, m in items:
+        if topic == "/cheap/fix":
+            kept.append((topic, at, make.fix(at, m.latitude, m.longitude, m.altitude, 0, unknown)))
+        elif topic != "/fix":
+            kept.append((topic, at, m))
+    for topic, at, m in kept:
+        if hilly and topic.endswith("/fix"):
+            m.altitude += 20.0 * np.sin((at - START_NS) / S / 15.0)
+    _, config, _ = look(tmp_path, sorted(kept, key=lambda item: item[1]), make)
+    assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == ["/fix"]
+
+
 def test_what_two_receivers_differ_by_is_in_the_slow_error(tmp_path: Path) -> None:
     """Without its height nothing tells which of the two drifts."""
     make = Messages(2)
