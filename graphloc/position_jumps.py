@@ -31,9 +31,10 @@ _EVEN = 1.5  # steps in time that differ by more than this factor are not compar
 _IN_BOUNDS = 1.5  # sigmas of the slow error that the bounds include: jumps up to there need no word
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
 # Off a track: fixes on either side of a jump are compared for so long, and at least so many, of which as many lie on their side, as two
-# outliers in a row are no jump; by how many sigmas of that they differ, and by how much at least; what share of it comes from one fix to the
-# next, as where track and fixes part otherwise they do so little by little.
-_BESIDE_S, _FEWEST_BESIDE, _OFF_SIGMAS, _OFF_M, _AT_ONCE = 2.0, 3, 8.0, 1.0, 0.5
+# outliers in a row are no jump (of fixes that are farther apart than that two, as the track follows after these); by how many sigmas of
+# that they differ, and by how much at least; what share of it comes from one fix to the next, as where track and fixes part otherwise they
+# do so little by little.
+_BESIDE_S, _FEWEST_BESIDE, _SLOW_S, _OFF_SIGMAS, _OFF_M, _AT_ONCE = 2.0, 3, 2.5, 8.0, 1.0, 0.5
 _GAP = 3.0  # times the usual time between fixes
 _KEPT = 200
 _FITS_SIGMAS, _CERTAIN_SIGMAS = 5.0, 8.0  # off a prediction
@@ -104,7 +105,8 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
     """
     dt_s = np.diff(stamps_ns) / NS_PER_S
     usual_s = float(np.median(dt_s)) if len(dt_s) else np.inf
-    n = max(_FEWEST_BESIDE, round(_BESIDE_S / max(usual_s, 1e-3)))
+    fewest = _FEWEST_BESIDE if usual_s < _SLOW_S else 2
+    n = max(fewest, round(_BESIDE_S / max(usual_s, 1e-3)))
     if len(off_m) < max(2 * n, _FEWEST):
         return np.zeros(0, dtype=np.int64), np.zeros(0)
     steps = np.diff(off_m, axis=0)
@@ -123,7 +125,7 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
     along_m = np.einsum("ni,ni->n", steps[inner], change) / np.maximum(size_m, 1e-9)
     # Over a gap the track bends, too, where the IMU is worse than it is taken for.
     jumps = (size_m > least_m) & (along_m > _AT_ONCE * size_m) & (dt_s[inner] < _GAP * usual_s)
-    jumps &= np.minimum(after, before) >= _FEWEST_BESIDE
+    jumps &= np.minimum(after, before) >= fewest
     left_m, found = np.where(jumps, size_m, 0.0), list[int]()
     while left_m.max() > 0.0:
         found.append(int(np.argmax(left_m)))

@@ -541,6 +541,16 @@ def test_what_a_track_leaves_of_its_fixes_shows_jumps_and_neither_outliers_nor_b
     assert seen(jump, (t < 59.0 - 5.0 / hz) | (t >= 60.0)) == []  # over a gap anything may have moved
 
 
+def test_of_fixes_seconds_apart_two_on_each_side_show_a_jump() -> None:
+    """The track is there after two of them, where three had to be off it: drawn vessels with a fix each 3.5 s followed jumps of 11 m."""
+    t = np.arange(0.0, 240.0, 4.0)
+    off_m = np.random.default_rng(3).normal(0.0, 0.2, (len(t), 2))
+    assert not len(jumps_off_track(np.round(t * 1e9).astype(np.int64), off_m, allowed_m=3.0)[0])
+    off_m[:, 0] += np.where(t < 120.0, -6.0, 6.0) * np.exp(-np.abs(t - 119.0) / 3.0)
+    at_ns, _ = jumps_off_track(np.round(t * 1e9).astype(np.int64), off_m, allowed_m=3.0)
+    assert at_ns.tolist() == [120_000_000_000]
+
+
 def lone_problem(slow: SlowErrorConfig | None = None) -> Problem:
     """A short run of one receiver, IMU and compass, ready to be solved."""
     _, recording, config = jumping_alone(5.0, (0.0, 0.0), 12.0, slow=slow)
@@ -601,6 +611,18 @@ def test_a_run_that_cannot_be_solved_with_its_jumps_is_solved_without(monkeypatc
     assert found.values.atPose3(last).equals(right.values.atPose3(last), 1e-3)
 
 
+def test_jumps_that_do_not_make_the_run_clearly_more_probable_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a receiver whose fixes wandered by metres within seconds seven were: 15 m off, and 3 m without them."""
+    problem = lone_problem()
+    right = _batch.solve_batch(problem)
+    jumped = with_jumps_off_track(problem, off_at(problem, 4.1, 8.1))
+    monkeypatch.setattr(_batch, "with_jumps_off_track", lambda *_: jumped)
+    found = _batch.solve_batch(problem)
+    assert found.stated is problem
+    last = keys.pose(len(problem.timeline) - 1)
+    assert found.values.atPose3(last).equals(right.values.atPose3(last), 1e-3)
+
+
 def test_jumps_found_with_noise_that_needs_another_start_are_stated(monkeypatch: pytest.MonkeyPatch) -> None:
     """The slow error was a state, and counted once more as left out; nothing was said of the jumps."""
     problem = lone_problem()
@@ -615,6 +637,7 @@ def test_jumps_found_with_noise_that_needs_another_start_are_stated(monkeypatch:
     monkeypatch.setattr(_batch, "with_jumps_off_track", lambda *_: seen.pop(0))
     monkeypatch.setattr(_batch, "with_needed_noise", lambda *_: noisier.pop(0))
     monkeypatch.setattr(_batch, "_first_solution", by_motion)
+    monkeypatch.setattr(_batch, "_CLEARLY", -np.inf)  # these fixes do not jump
     found = _batch.solve_batch(problem)
     assert seen == noisier == []
     for of in (found.problem, found.stated):

@@ -49,7 +49,7 @@ from graphloc.solve._decide import AGREES, Stage, Verdicts, agrees, met, weigh
 from graphloc.solve._grow import grow
 from graphloc.solve._imu_mount import MountError, with_mount_estimated
 from graphloc.solve._imu_noise import with_needed_noise
-from graphloc.solve._jumps import with_jumps_of, with_jumps_off_track
+from graphloc.solve._jumps import jumps_in, with_jumps_of, with_jumps_off_track
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import (
@@ -131,11 +131,15 @@ def solve_batch(
     for _ in range(0 if newest else _MAX_JUMP_ROUNDS):
         if (jumping := with_jumps_off_track(problem, solved.settled.verdicts)) is None:
             break
-        without = begun, solved.choice()
+        without, count = (begun, solved.choice()), jumps_in(jumping) - jumps_in(problem)
+        lowest = _cost(problem, solved.settled.values, begun.prior) - _CLEARLY * count
         del solved  # and its graph, before the next one is made
         try:
             begun, solved = _first_solution(jumping, progress, newest=newest, doubt_imu=doubt_imu)
+            clearly = _cost(jumping, solved.settled.values, begun.prior) < lowest
         except SolveError:
+            clearly = False
+        if not clearly:
             begun, choice = without
             solved = choice.settled_again(begun.prior, progress)
             break
@@ -248,7 +252,7 @@ def _first_solution(problem: Problem, progress: Progress, *, newest: bool, doubt
     few = thinned(problem)
     begun = whole = _begin(problem, few, progress, newest=newest, doubt_imu=doubt_imu)
     solved = _from_there(problem, few, begun, progress)
-    misfit, last = solved.misfit(), len(problem.timeline) - 1
+    misfit = solved.misfit()
     doubted = [] if newest else [
         number
         for number, stream in enumerate(problem.streams)
@@ -259,10 +263,7 @@ def _first_solution(problem: Problem, progress: Progress, *, newest: bool, doubt
     if not doubted:
         return begun, solved
 
-    def cost(values: gtsam.Values, prior: StartPrior) -> float:
-        return cost_as_configured(problem, values, 0, last, prior, judged=last)
-
-    lowest, best = cost(solved.settled.values, begun.prior) - _CLEARLY, (begun, solved.choice())
+    lowest, best = _cost(problem, solved.settled.values, begun.prior) - _CLEARLY, (begun, solved.choice())
     iterations, passes = begun.iterations + solved.settled.iterations, solved.settled.passes
     del solved  # and its graph, before the next one is made
     for number in doubted:
@@ -274,7 +275,7 @@ def _first_solution(problem: Problem, progress: Progress, *, newest: bool, doubt
         solved = _from_there(problem, few, begun, progress)
         iterations += begun.iterations + solved.settled.iterations
         passes += solved.settled.passes
-        if (found := cost(solved.settled.values, begun.prior)) < lowest:
+        if (found := _cost(problem, solved.settled.values, begun.prior)) < lowest:
             if _off(problem.streams[number], solved.settled.verdicts).mean() < _MOSTLY:
                 # The sensor tells the heading after all.
                 begun = whole._replace(values=begun.values, prior=begun.prior)
@@ -284,6 +285,12 @@ def _first_solution(problem: Problem, progress: Progress, *, newest: bool, doubt
     again = choice.settled_again(begun.prior, progress)
     settled = replace(again.settled, passes=again.settled.passes + passes)
     return begun._replace(iterations=iterations), again._replace(settled=settled)
+
+
+def _cost(problem: Problem, values: gtsam.Values, prior: StartPrior) -> float:
+    """Return -log of how probable a run is (but for a constant), with each sensor's loss as wide as configured."""
+    last = len(problem.timeline) - 1
+    return cost_as_configured(problem, values, 0, last, prior, judged=last)
 
 
 def _off(stream: Stream, verdicts: Verdicts) -> NDArray[np.bool_]:

@@ -13,6 +13,11 @@ from graphloc.solve._decide import Verdicts
 from graphloc.time import stamps_of
 
 
+def jumps_in(problem: Problem) -> int:
+    """Return how many position jumps a problem has."""
+    return sum(len(stream.position_jumps[0]) for stream in problem.streams)
+
+
 def with_jumps_off_track(problem: Problem, verdicts: Verdicts) -> Problem | None:
     """Return the problem with position jumps that a solution of it shows; None where it shows no more than it has.
 
