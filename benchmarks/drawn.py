@@ -33,6 +33,7 @@ from graphloc.trajectory import Trajectory
 SEEDS = range(1000, 1080)  # none was looked at when a model or a number was chosen
 NOISE_SEEDS, STATED_SEEDS = range(1100, 1116), range(1120, 1136)  # nor these
 ASKEW_SEEDS, DISPLACED_SEEDS = range(1140, 1156), range(1160, 1176)
+LONE_SEEDS = range(1180, 1230)
 Found = dict[str, Any]
 _TOO_SURE = 6.0  # horizontal NEES: 2 where the covariance is true
 
@@ -254,6 +255,28 @@ def antennas(pool: ProcessPoolExecutor) -> list[Row]:
     """Figures of antennas that sit a metre or two from where they are configured."""
     found = list(pool.map(_displaced, DISPLACED_SEEDS))
     return _with_bounds("F.antenna", f"{len(found)} drawn vessels, antenna", found)
+
+
+def lone(run: DrawnRun) -> DrawnRun | None:
+    """The vessel with a receiver's fixes and a compass alone, beside the IMU; None where it has no compass."""
+    kept = ("imu", "height", "gnss", "compass")
+    sensors = {name: sensor for name, sensor in run.config.sensors.items() if sensor.kind in kept}
+    if not any(sensor.kind == "compass" for sensor in sensors.values()):
+        return None
+    left = tuple(m for m in run.recording.measurements if m.sensor in sensors)
+    config = run.config.model_copy(update={"sensors": sensors})
+    return replace(run, recording=replace(run.recording, measurements=left), config=config)
+
+
+def _lone(seed: int) -> Found | None:
+    run = lone(drawn_run(seed))
+    return None if run is None else _both_ways({"compass": run})
+
+
+def alone(pool: ProcessPoolExecutor) -> list[Row]:
+    """Figures of what most vessels have: one receiver and a compass, and nothing that tells its drift and jumps from motion."""
+    found = [one for one in pool.map(_lone, LONE_SEEDS) if one is not None]
+    return _with_bounds("F.alone", f"{len(found)} drawn vessels, one receiver and a", found)
 
 
 def _line(found: Found, before: Found | None) -> str:

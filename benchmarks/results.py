@@ -80,6 +80,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "F.drawn": drawn.figures,
     "F.mount": drawn.askew,
     "F.antenna": drawn.antennas,
+    "F.alone": drawn.alone,
     "F.noise": drawn.noise,
     "F.stated": drawn.stated,
 }
