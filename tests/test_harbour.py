@@ -21,7 +21,7 @@ from graphloc import app
 from graphloc.errors import ConfigError, OutputError
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, find_scenario, harbour_scenarios, simulate
-from graphloc.eval.simulate.aerial import grid_from_enu, render, utm_epsg
+from graphloc.eval.simulate.aerial import _FINE, _averaged, _Pen, grid_from_enu, render, utm_epsg
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.eval.simulate.harbour import Harbour, load_harbour, make_harbour, shipped
 from graphloc.eval.simulate.lidar import scan, world_points
@@ -173,6 +173,30 @@ def test_the_vessel_rides_its_route_on_the_tide(run: SimulatedRun) -> None:
     course = np.arctan2(run.truth.v_world_mps[middle, 1], run.truth.v_world_mps[middle, 0])
     assert np.degrees(np.abs(np.angle(np.exp(1j * (course - run.truth.yaw_rad[middle]))))).max() < 6.0
     assert run.truth.p_world_m[:, 2].mean() == pytest.approx(SHORT.tide_m, abs=0.05)
+
+
+def test_a_canvas_is_averaged_over_blocks() -> None:
+    fine = np.random.default_rng(1).uniform(0.0, 255.0, (6 * _FINE, 4 * _FINE, 3)).astype(np.float32)
+    found = _averaged(fine)
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, fine.reshape(6, _FINE, 4, _FINE, 3).mean(axis=(1, 3)))
+
+
+def test_grain_is_grey() -> None:
+    """As dark in each channel, over all of the water and over a part."""
+    water = (40, 60, 80)
+    pen = _Pen(
+        np.random.default_rng(1), Datum(Geodetic(57.7, 11.9, 0.0)), 32632, 0.0, 0.0, 0.1, (30, 40), np.zeros(2), water
+    )
+    inside = np.zeros((30, 40), dtype=np.bool_)
+    inside[5:20, 10:30] = True
+    for _ in range(2):
+        grain = pen.canvas - np.array(water, dtype=np.float32)
+        assert grain.std() > 1.0
+        np.testing.assert_allclose(grain - grain[..., :1], 0.0, atol=1e-4)
+        before = pen.canvas.copy()
+        pen.mottle(pen.canvas, inside, 4.0, (0.3, 1.5))
+        assert (np.any(pen.canvas != before, axis=2) <= inside).all()
 
 
 def test_the_image_lies_where_its_georeference_says(tmp_path: Path) -> None:

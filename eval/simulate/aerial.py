@@ -124,12 +124,21 @@ def render(harbour: Harbour, seed: int, pixel_m: float = 0.16, shift_sigma_m: fl
         rng, harbour.datum, epsg, left, top, pixel_m / _FINE, (rows * _FINE, columns * _FINE), shift, season.water
     )  # fmt: skip
     _draw(pen, harbour, season, rng)
-    fine = pen.canvas.reshape(rows, _FINE, columns, _FINE, 3).mean(axis=(1, 3))
+    fine = _averaged(pen.canvas)
     soft = cv2.GaussianBlur(fine, (0, 0), rng.uniform(0.5, 0.9))
     noisy = soft * season.light * rng.uniform(0.9, 1.08) + rng.normal(0.0, 3.0, soft.shape)
     coded = cv2.imencode(".jpg", np.clip(noisy, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 82])[1]
     pixels = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), dtype=np.uint8)
     return RenderedImage(pixels, epsg, left, top, pixel_m, shift)
+
+
+def _averaged(canvas: Canvas) -> Canvas:
+    """Return the means of a canvas's blocks of `_FINE` by `_FINE` pixels: as `mean` over two axes, bit for bit, in a fifth of the time."""
+    total = np.zeros_like(canvas[::_FINE, ::_FINE])
+    for row in range(_FINE):
+        for column in range(_FINE):
+            total += canvas[row::_FINE, column::_FINE]
+    return total / np.float32(_FINE**2)
 
 
 class _Pen:
@@ -196,7 +205,9 @@ class _Pen:
             step = max(1, round(size / self.pixel_m / 2))
             coarse = self._rng.normal(0.0, noise, (rows // step + 2, columns // step + 2)).astype(np.float32)
             grain = cv2.resize(coarse, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
-            painted += (grain if whole else grain[inside])[..., None] / len(sizes_m)
+            share = (grain if whole else grain[inside]) / len(sizes_m)
+            for channel in range(3):  # all at once, with three in the innermost loop, takes twice as long
+                painted[..., channel] += share
         if not whole:
             part[inside] = painted
 
