@@ -31,7 +31,7 @@ class GraphUpdate:
     guesses: tuple[tuple[int, Any], ...] = ()
 
 
-class Felt(NamedTuple):
+class FeltMotion(NamedTuple):
     """What an IMU feels about a stamp, biases removed.
 
     Attributes:
@@ -91,7 +91,7 @@ class Attachment:
     slow_walk: Array | None = None
     constants: tuple[tuple[int, Array], ...] = ()
     T_solver: Any | None = None
-    felt: Felt | None = None
+    felt: FeltMotion | None = None
 
     def swing_mps(self, off_m: Array | None = None) -> Array:
         """Return the velocity (3,) of the sensor by the turning of the body, w x l, body axes, m/s.

@@ -16,7 +16,7 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL
 from graphloc.factors.velocity import ROW
 from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision, Felt
+from graphloc.graph import Attachment, Decision, FeltMotion
 from graphloc.linear import factors_of
 from graphloc.measurements import GnssVelocity, ImuSeries
 from graphloc.replay import replay
@@ -31,7 +31,7 @@ LATE_S = 0.2
 SCENARIO = Scenario(
     path="turn", duration_s=60.0, noise="clean", pose_hz=0.0, compass_hz=0.0, gnss_hz=1.0, gnss_sigma_m=0.02, imu_hz=50.0
 )  # fmt: skip
-FELT = Felt(np.array([0.8, -0.5, 9.9]), np.array([0.1, 0.3, -0.2]), np.array([0.0, 0.0, -9.81]))
+FELT = FeltMotion(np.array([0.8, -0.5, 9.9]), np.array([0.1, 0.3, -0.2]), np.array([0.0, 0.0, -9.81]))
 
 
 @cache
@@ -126,7 +126,7 @@ def test_a_velocity_is_that_of_the_antenna_at_another_time() -> None:
     pose = type(at.T_world_body)(type(at.T_world_body.rotation())(R), np.zeros(3))
     at = replace(
         at, T_world_body=pose, v_world_mps=v, dv_world_mps=np.zeros(3), lever_m=lever, gyro_radps=body_radps(t),
-        felt=Felt(force, spin, g), constants=((6, np.array([late_s])),),
+        felt=FeltMotion(force, spin, g), constants=((6, np.array([late_s])),),
     )  # fmt: skip
     m = ROW.ideal(at, config)
     assert isinstance(m, GnssVelocity)

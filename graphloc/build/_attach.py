@@ -13,7 +13,7 @@ from graphloc import keys
 from graphloc.build._chains import walk_between_nodes
 from graphloc.config import VesselConfig
 from graphloc.frames import Array, Datum
-from graphloc.graph import TIME_OFFSET, Attachment, Constant, Felt, InertialLink, Sensor, SlowProcess
+from graphloc.graph import TIME_OFFSET, Attachment, Constant, FeltMotion, InertialLink, Sensor, SlowProcess
 from graphloc.measurements import Measurement
 
 Carry = tuple[int, Any]
@@ -202,10 +202,10 @@ def asks_for_delay(stream: Attaching) -> bool:
     return any(TIME_OFFSET in constant.corrects for constant in stream.constants)
 
 
-def _felt(problem: Sited, raw: Array, turn: Array, bias: Any) -> Felt:
+def _felt(problem: Sited, raw: Array, turn: Array, bias: Any) -> FeltMotion:
     """Return what the IMU feels; `turn` (3, 3): from the body at the measurement to that at the state."""
     force = raw[:3] - problem.R_body_imu @ bias.accelerometer()
-    return Felt(turn @ force, turn @ raw[3:], problem.links.gravity_mps2)
+    return FeltMotion(turn @ force, turn @ raw[3:], problem.links.gravity_mps2)
 
 
 def _slow_walk(problem: Sited, stream: Attaching, i: int) -> Array | None:
