@@ -25,10 +25,9 @@ import numpy as np
 
 from graphloc.config import GnssConfig
 from graphloc.factors._noise import noise_model, with_floors
+from graphloc.factors._receiver import stamps_and_antenna
 from graphloc.frames import Array, Datum, Geodetic, skew
 from graphloc.graph import (
-    PLACE,
-    TIME_OFFSET,
     Attachment,
     Constant,
     Decision,
@@ -163,15 +162,7 @@ def slow(config: GnssConfig) -> SlowProcess | None:
 
 def constants(config: GnssConfig) -> tuple[Constant, ...]:
     """Return how much later than stamped fixes were measured, s, and how far off the antenna is, m, as far as that is not known."""
-    unknown: dict[str, float] = {}
-    if config.stamp_sigma_s > 0.0:
-        unknown[TIME_OFFSET] = config.stamp_sigma_s
-    if config.mount_sigma_m > 0.0:
-        unknown |= dict.fromkeys(PLACE, config.mount_sigma_m)
-    if not unknown:
-        return ()
-    # One of all: a linear factor has three states at most.
-    return (Constant(name="stamps and antenna", sigma=np.array([*unknown.values()]), corrects=tuple(unknown)),)
+    return stamps_and_antenna(config.stamp_sigma_s, config.mount_sigma_m)
 
 
 def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:

@@ -37,11 +37,13 @@ from graphloc.config import ImuConfig
 from graphloc.frames import Array
 from graphloc.graph import Going
 from graphloc.measurements import ImuSeries
+from graphloc.series import integral, interpolated
 
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # white noise of unknown motion in a gap
 _SHORT_S = 2.0  # longest gap that is interpolated linearly
 _FORGET_S, _AROUND_S = 1.0, 10.0  # decay of the last sample in a gap; length of the means on either side
 _GAP_STEP_S = 0.1  # integration step across a gap
+_ABOUT_NS = 100_000_000  # to either side of a stamp: shorter than waves, longer than vibration
 _INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz)-like floor that keeps position covariance positive
 
 
@@ -215,6 +217,28 @@ class Links:
     def gyro_at(self, stamps_ns: NDArray[np.int64]) -> Array:
         """Return the raw rates (M, 3), rad/s, in body axes."""
         return np.asarray(self._at(stamps_ns)[:, 3:] @ self._R_body_imu.T)
+
+    def felt_at(self, stamps_ns: NDArray[np.int64]) -> Array:
+        """Return the raw specific force, m/s^2, and the change of the rate, rad/s^2 (M, 6), in body axes, each by means over 0.2 s."""
+        stamps = self._stamps
+        begin, end = (np.clip(stamps_ns + side, stamps[0], stamps[-1]) for side in (-_ABOUT_NS, _ABOUT_NS))
+        first = max(int(np.searchsorted(stamps, begin.min(), side="right")) - 1, 0)
+        last = int(np.searchsorted(stamps, end.max(), side="left")) + 1
+        t = (stamps[first:last] - stamps[first]) * 1e-9
+        sums = integral(t, self._samples[first:last])
+        edges = [(at - stamps[first]) * 1e-9 for at in (begin, (begin + end) // 2, end)]
+        before, middle, after = (interpolated(edge, t, sums) for edge in edges)
+        span = np.maximum(edges[2] - edges[0], 1e-9)[:, None]
+        felt = np.hstack([(after - before)[:, :3] / span, (after - 2.0 * middle + before)[:, 3:] * (2.0 / span) ** 2])
+        outside = span[:, 0] < 1e-10 * _ABOUT_NS
+        felt[outside, 3:] = 0.0  # beyond the data
+        felt[outside, :3] = self._at(stamps_ns[outside])[:, :3]
+        return np.asarray((felt.reshape(-1, 2, 3) @ self._R_body_imu.T).reshape(-1, 6))
+
+    @property
+    def gravity_mps2(self) -> Array:
+        """Gravity (3,) in world where it is felt."""
+        return np.array([0.0, 0.0, -self._gravity_mps2])
 
     def bias_steps(self, dt_s: float) -> Array:
         """Return the sigmas (6,) of the bias's random walk over `dt_s`: m/s^2, rad/s."""

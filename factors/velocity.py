@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """GNSS velocity of the antenna.
 
-    z = v + dv + R (omega x (l + o)) + w,   w ~ N(0, C)
+    z = v + dv + R (omega x (l + o)) + a tau + w,   w ~ N(0, C)
+    a = R (f + alpha x (l + o) + omega x (omega x (l + o))) + g
 
 v: velocity of body in world at the state; dv: its change until the measurement, by the IMU; omega: body rate from the gyroscope,
-bias removed; l: antenna in body; o: how far from there it sits, a constant of the run, where that is not known. d z / d v = I,
-d z / d theta = -R [omega x (l + o)]_x. The lever-arm term carries information: in waves it shows the heading. With R fixed at the
+bias removed; l: antenna in body; o: how far from there it sits, a constant of the run, where that is not known; a: acceleration of
+the antenna, by the specific force f and the change alpha of the body rate; tau: how much later than stamped it was measured
+(negative: stamped late), a constant of the run, where that is not known. d z / d v = I,
+d z / d theta = -R [omega x (l + o) + (f + ...) tau]_x. The lever-arm term carries information: in waves it shows the heading. With R fixed at the
 estimate in it, passes converged slowly (not after 6). dv and omega are taken from the estimate at every pass; dv within half a period
-of the states turns by 9 mm/s for 1 deg of attitude.
+of the states turns by 9 mm/s for 1 deg of attitude. Not handled: of tau what a changes by in that time.
 """
 
 from __future__ import annotations
@@ -16,40 +19,59 @@ import numpy as np
 
 from graphloc.config import VelocityConfig
 from graphloc.factors._noise import with_floors
+from graphloc.factors._receiver import stamps_and_antenna
 from graphloc.frames import Array, Datum, skew
-from graphloc.graph import PLACE, Attachment, Constant, Hint, Residual, Sensor
+from graphloc.graph import Attachment, Constant, Hint, Residual, Sensor
 from graphloc.measurements import GnssVelocity
 
 
-def _off_m(at: Attachment) -> Array | None:
-    """Return o (3,), m, in the antenna's axes; None where it is not estimated."""
-    return at.constants[0][1] if at.constants else None
+def _late_and_off(at: Attachment, config: VelocityConfig) -> tuple[float, Array | None]:
+    """Return tau, s, and o (3,), m, in the antenna's axes; 0 and None where they are not estimated."""
+    if not at.constants:  # of a sensor with none, or taken as configured to examine that
+        return 0.0, None
+    value = at.constants[0][1]
+    late = float(value[0]) if config.stamp_sigma_s > 0.0 else 0.0
+    return late, value[-3:] if config.mount_sigma_m > 0.0 else None
 
 
-def _attitude_jacobian(at: Attachment) -> Array:
-    """Return the derivative (3, 6) of R Exp(theta) (omega x l) by the body tangent (theta, rho)."""
-    swing = skew(at.swing_mps(_off_m(at)))
-    return np.hstack([-at.T_world_body.rotation().matrix() @ swing, np.zeros((3, 3))])
+def _predicted_mps(at: Attachment, config: VelocityConfig) -> Array:
+    """The velocity (3,) without noise, in world."""
+    late, off = _late_and_off(at, config)
+    v = at.sensor_velocity_mps(off)
+    return v + at.sensor_acceleration_mps2(off) * late if late else v
 
 
-def _by_constants(at: Attachment) -> tuple[Array, ...]:
-    """Return the derivative (3, 3) of the velocity by o, where that is estimated."""
+def _attitude_jacobian(at: Attachment, config: VelocityConfig) -> Array:
+    """Return the derivative (3, 6) of what R turns by the body tangent (theta, rho)."""
+    late, off = _late_and_off(at, config)
+    turned = at.swing_mps(off) + (at.pushed_mps2(off) * late if late else 0.0)
+    return np.hstack([-at.T_world_body.rotation().matrix() @ skew(turned), np.zeros((3, 3))])
+
+
+def _by_constants(at: Attachment, config: VelocityConfig) -> tuple[Array, ...]:
+    """Return the derivative (3, k) of the velocity by tau and o, as far as they are estimated."""
     if not at.constants:
         return ()
-    R = at.T_world_body.rotation().matrix()
-    return (R @ skew(at.gyro_radps) @ at.T_state_sensor.rotation().matrix(),)
+    late, off = _late_and_off(at, config)
+    columns = [at.sensor_acceleration_mps2(off)[:, None]] if config.stamp_sigma_s > 0.0 else []
+    if config.mount_sigma_m > 0.0:
+        swing = skew(at.gyro_radps)
+        if late and at.felt is not None:
+            swing = swing + late * (skew(at.felt.spin_radps2) + swing @ swing)
+        columns.append(at.T_world_body.rotation().matrix() @ swing @ at.T_state_sensor.rotation().matrix())
+    return (np.hstack(columns),) if columns else ()
 
 
 def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[Residual, ...]:
     """Return predicted - measured (3,), m/s, in world."""
-    raw = at.sensor_velocity_mps(_off_m(at)) - m.v_world_mps
+    raw = _predicted_mps(at, config) - m.v_world_mps
     return (
         Residual(
             raw=raw,
             cov=with_floors(m.cov_m2ps2, config.min_sigma_mps**2),
-            jacobian=lambda: _attitude_jacobian(at),
+            jacobian=lambda: _attitude_jacobian(at, config),
             velocity_jacobian=lambda: np.eye(3),
-            constant_jacobians=lambda: _by_constants(at),
+            constant_jacobians=lambda: _by_constants(at, config),
             prior=1.0,
             size_m=None,
             size_deg=None,
@@ -58,10 +80,8 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
 
 
 def constants(config: VelocityConfig) -> tuple[Constant, ...]:
-    """Return how far off the antenna is, m, where that is not known."""
-    if config.mount_sigma_m == 0.0:
-        return ()
-    return (Constant(name="antenna", sigma=np.full(3, config.mount_sigma_m), corrects=PLACE),)
+    """Return how much later than stamped velocities were measured, s, and how far off the antenna is, m, as far as that is not known."""
+    return stamps_and_antenna(config.stamp_sigma_s, config.mount_sigma_m)
 
 
 def ideal(at: Attachment, config: VelocityConfig) -> GnssVelocity:
@@ -70,7 +90,7 @@ def ideal(at: Attachment, config: VelocityConfig) -> GnssVelocity:
         stamp_ns=0,
         sensor="gnss_velocity",
         seq=0,
-        v_world_mps=at.sensor_velocity_mps(_off_m(at)),
+        v_world_mps=_predicted_mps(at, config),
         cov_m2ps2=np.eye(3) * 0.01,
     )
 

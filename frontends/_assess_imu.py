@@ -184,7 +184,7 @@ def turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -
 
 def felt_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Felt:
     """Return the motion by an IMU whose mount is known or guessed, in the axes of the vessel."""
-    return Felt.of(*_in_body(imu, report, tree, body))
+    return Felt.of(*_in_body(imu, report, tree, body), 0.0 if report.gravity == "removed" else STANDARD_GRAVITY_MPS2)
 
 
 def _in_body(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> tuple[NDArray[np.int64], Array, Array]:

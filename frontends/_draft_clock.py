@@ -29,6 +29,7 @@ _OWN_CLOCK_S = 10.0  # no message takes as long
 _FEWEST_STAMPS = 10  # that tell of a clock
 _STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma: a receiver's stamps; recording times instead of these
 _STAMPS = "stamped when measured, or later? estimated with the run; 0 where a receiver's clock stamps"
+_ESTIMATED = ("gnss", "gnss_velocity")  # whose delay is, with the run
 _SET = ("imu", "gnss", "gnss_velocity", "body_velocity", "compass")  # whose clocks are set; poses may take their time
 
 
@@ -50,7 +51,7 @@ def _stamp_lines(kind: str, own: TopicReport) -> list[str]:
     """Say where recording times stand for stamps."""
     if not own.recorded:
         return []
-    unknown = "" if kind == "gnss" else ", which no bound includes"
+    unknown = "" if kind in _ESTIMATED else ", which no bound includes"
     said = f"guess: its headers hold no stamps, or whole seconds only; recording times are late by as long as a message takes{unknown}"
     return [f"  stamps: recorded  # {said}"]
 
@@ -91,7 +92,7 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
         clock = "the IMU's" if reference is imu else "one that tells the date"
         why.append(
             f"its clock is {'behind' if behind > 0 else 'ahead of'} {clock}, by the recording times; how much longer one "
-            f"message takes than the other is in it{'' if kind == 'gnss' else ', which no bound includes'}"
+            f"message takes than the other is in it{'' if kind in _ESTIMATED else ', which no bound includes'}"
         )
     if late is not None:
         offset_s, sigma_s = offset_s + late[0], max(late[1], _STAMPED_LATE_S)
@@ -103,7 +104,7 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
     fixes_late_s = next((r.late_s[0] for r in inspection.gnss if r.late_s), 0.0)
     if kind == "gnss_velocity" and late is not None and late[0] < fixes_late_s - MOST_ON_ITS_WAY_S:
         lines.append(f"  min_sigma_mps: {_FILTERED_SIGMA_MPS}  # guess: so late, it is filtered, and its error lasts")
-    if kind == "gnss":
+    if kind in _ESTIMATED:
         hinted = next((r.hinted_s for r in inspection.gnss if r.topic.partition(" ")[0] == topic and r.hinted_s), None)
         said = (
             ""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion
@@ -25,6 +26,7 @@ STEP_S = 0.5  # between two times at which it is asked
 FEWEST, MOVES_M = 20, 1.0  # windows; a shorter way has no direction
 _MIN_COHERENCE, _CLEAR = 0.25, 4.0  # and so many times what chance gives
 _LIKELY_COHERENCE, _LIKELY = 0.5, 3.0  # the same, to choose between quarter turns: chance gives it once in 8000
+_WAVES_S = 20.0  # the longest that tilt it
 _ASTRAY_DEG = 30.0  # leeway, or an antenna far ahead, make less
 
 
@@ -70,22 +72,33 @@ class YawInCraft:
 class Felt:
     """Motion by a levelled IMU: times (N,), s since `origin_ns`, angle turned, rad, and the double integral of its acceleration.
 
-    The latter is (N,) m, x + i y, in the axes at the begin.
+    The latter is (N,) m, x + i y, in the axes at the begin; in these, too, what a place a metre above the IMU moves by as the craft
+    rolls and pitches, `swing_m` (N,).
     """
 
     origin_ns: int
     t_s: Array
     turned: Array
     way_m: NDArray[np.complex128]
+    swing_m: NDArray[np.complex128]
 
     @classmethod
-    def of(cls, stamps_ns: NDArray[np.int64], accel: Array, gyro: Array) -> Felt:
-        """Of samples: stamps (N,), increasing; accelerations (N, 3) m/s^2 and rates (N, 3) rad/s, levelled."""
+    def of(cls, stamps_ns: NDArray[np.int64], accel: Array, gyro: Array, gravity_mps2: float = 0.0) -> Felt:
+        """Of samples: stamps (N,), increasing; accelerations (N, 3) m/s^2 and rates (N, 3) rad/s, levelled.
+
+        Args:
+            gravity_mps2: what of gravity waves tilt into the horizontal is taken out; 0: nothing.
+        """
         t = (stamps_ns - stamps_ns[0]) / NS_PER_S
         turned = integral(t, gyro[:, 2])
         a = accel[:, 0] + 1j * accel[:, 1]
         a = a - np.median(a.real) - 1j * np.median(a.imag)
-        return cls(int(stamps_ns[0]), t, turned, integral(t, integral(t, a * np.exp(1j * turned))))
+        swing = integral(t, (gyro[:, 1] - 1j * gyro[:, 0]) * np.exp(1j * turned))
+        # Tilted ahead, an accelerometer feels gravity astern. What lasts longer than waves the gyroscope does not know.
+        lately = max(1, round(_WAVES_S / max(float(np.median(np.diff(t))), 1e-3)))
+        tilt = swing - uniform_filter1d(swing, lately)
+        moved = a * np.exp(1j * turned) + gravity_mps2 * tilt
+        return cls(int(stamps_ns[0]), t, turned, integral(t, integral(t, moved)), swing)
 
     @property
     def turning(self) -> Turning:

@@ -102,7 +102,8 @@ class MotionOffset(NamedTuple):
 def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | None:
     """Return by how much the stamps of a motion are off, by the accelerometer; None if that does not show it.
 
-    Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. With correlation
+    Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. Pitch swings a high
+    antenna along it, so its height is estimated with the offset: c is the correlation with what is felt and that swing together. With
     c at the best offset and c0 at none, N (c^2 - c0^2) / (1 - c^2) is the gain in chi-square over N windows.
 
     Args:
@@ -123,7 +124,7 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
             continue
         middle = middle[good]
         along = (moved * np.conj(chord / np.maximum(np.abs(chord), MOVES_M)))[good].real
-        c = np.array([_together(along, _felt_along(felt, middle + lag, half_s)) for lag in lags])
+        c = np.array([_explained(along, *_felt_along(felt, middle + lag, half_s)) for lag in lags])
         k = int(c.argmax())
         bend = 0.0 if k in (0, len(c) - 1) else float(2.0 * c[k] - c[k - 1] - c[k + 1]) / _APART_S**2
         if bend <= 0.0 or c[k] <= 0.0:
@@ -162,13 +163,16 @@ def later_than(fixes: MeasuredMotion, velocity: MeasuredMotion) -> tuple[float, 
     return value, float(np.sqrt(0.5 * left / (power * windows)))
 
 
-def _felt_along(felt: Felt, middle_s: Array, half_s: float) -> Array:
-    """Return the sensor's own forward acceleration, times the square of `half_s`."""
-    moved, _ = bent(felt.t_s, felt.way_m, middle_s, half_s)
-    return np.asarray((moved * np.exp(-1j * np.interp(middle_s, felt.t_s, felt.turned))).real)
+def _felt_along(felt: Felt, middle_s: Array, half_s: float) -> tuple[Array, Array]:
+    """Return the sensor's own forward acceleration, and that of a place a metre above it by pitch alone, times the square of `half_s`."""
+    ahead = np.exp(-1j * np.interp(middle_s, felt.t_s, felt.turned))
+    moved, swung = (bent(felt.t_s, way, middle_s, half_s)[0] for way in (felt.way_m, felt.swing_m))
+    return (moved * ahead).real, (swung * ahead).real
 
 
-def _together(a: Array, b: Array) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    power = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / power if power > 0.0 else 0.0
+def _explained(along: Array, felt: Array, swung: Array) -> float:
+    """Return the correlation of an acceleration with what is felt and an unknown share of a swing; 0 where it is the opposite of what is felt."""
+    y, X = along - along.mean(), np.column_stack([felt - felt.mean(), swung - swung.mean()])
+    share = np.linalg.lstsq(X, y, rcond=None)[0]
+    power = float(y @ y)
+    return float(np.sqrt(max(share @ X.T @ y, 0.0) / power)) if power > 0.0 and share[0] > 0.0 else 0.0

@@ -14,7 +14,15 @@ from itertools import islice
 
 import numpy as np
 
-from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, ImuConfig, SensorConfig, VesselConfig
+from graphloc.config import (
+    BodyVelocityConfig,
+    CompassConfig,
+    GnssConfig,
+    ImuConfig,
+    SensorConfig,
+    VelocityConfig,
+    VesselConfig,
+)
 from graphloc.errors import InputError
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import courses_of_fixes, motion_of_fixes
@@ -341,13 +349,14 @@ def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) 
     for r in sensors:
         types = topics[r.config.topic].msgtypes
         unstamped = set(types) & set(UNSTAMPED)
-        estimated = isinstance(r.config, GnssConfig) and r.config.stamp_sigma_s > 0.0
+        receiver = r.config if isinstance(r.config, GnssConfig | VelocityConfig) else None
+        estimated = receiver is not None and receiver.stamp_sigma_s > 0.0
         if (unstamped or r.config.stamps == "recorded") and r.config.time_offset_s == 0.0 and not estimated:
             why = f"{either(types)} has no stamp" if unstamped else "stamps: recorded"
             lines.append(
                 f"{r.sensor}: {why}: recording times are used, which are late by as long as a message takes (a receiver's often "
                 "0.1 s and more); no bound includes that: set time_offset_s (negative)"
-                + (", or stamp_sigma_s" if r.config.kind == "gnss" else "")
+                + (", or stamp_sigma_s" if receiver is not None else "")
             )
     return lines
 

@@ -31,6 +31,19 @@ class GraphUpdate:
     guesses: tuple[tuple[int, Any], ...] = ()
 
 
+class FeltMotion(NamedTuple):
+    """What an IMU feels about a stamp, biases removed.
+
+    Attributes:
+        force_mps2: (3,) specific force. spin_radps2: (3,) change of the angular rate; both in the axes of the body at the state.
+        gravity_mps2: (3,) what is to be added to the force for an acceleration, world axes.
+    """
+
+    force_mps2: Array
+    spin_radps2: Array
+    gravity_mps2: Array
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Attachment:
     """Where a measurement meets the graph, and what the graph believes there now.
@@ -58,6 +71,7 @@ class Attachment:
             `build.walk_between_nodes`); None: there is no slow state.
         constants: key and estimate of each of the sensor's constants.
         datum: origin of world.
+        felt: what the IMU feels about the measurement; None where the delay of its stamp is not asked for.
     """
 
     pose_key: int
@@ -77,6 +91,7 @@ class Attachment:
     slow_walk: Array | None = None
     constants: tuple[tuple[int, Array], ...] = ()
     T_solver: Any | None = None
+    felt: FeltMotion | None = None
 
     def swing_mps(self, off_m: Array | None = None) -> Array:
         """Return the velocity (3,) of the sensor by the turning of the body, w x l, body axes, m/s.
@@ -92,6 +107,23 @@ class Attachment:
         """Return the velocity (3,) of the sensor at the measurement, world axes, m/s; `off_m`: see `swing_mps`."""
         swing = self.T_world_body.rotation().matrix() @ self.swing_mps(off_m)
         return np.asarray(self.v_world_mps + self.dv_world_mps + swing)
+
+    def pushed_mps2(self, off_m: Array | None = None) -> Array:
+        """Return what accelerates the sensor at the measurement but for gravity (3,), body axes, m/s^2; `off_m`: see `swing_mps`.
+
+        Raises:
+            ValueError: it is not known what the IMU feels.
+        """
+        if self.felt is None:
+            raise ValueError("an attachment without what the IMU feels")
+        lever_m = self.lever_m if off_m is None else self.lever_m + self.T_state_sensor.rotation().matrix() @ off_m
+        turning = np.cross(self.felt.spin_radps2, lever_m) + np.cross(self.gyro_radps, self.swing_mps(off_m))
+        return np.asarray(self.felt.force_mps2 + turning)
+
+    def sensor_acceleration_mps2(self, off_m: Array | None = None) -> Array:
+        """Return the acceleration (3,) of the sensor at the measurement, world axes, m/s^2; arguments and errors as of `pushed_mps2`."""
+        pushed = self.T_world_body.rotation().matrix() @ self.pushed_mps2(off_m)
+        return np.asarray(pushed + self.felt.gravity_mps2 if self.felt is not None else pushed)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -390,6 +422,15 @@ class InertialLink(Protocol):
 
     def gyro_at(self, stamps_ns: NDArray[np.int64]) -> Array:
         """Return the raw angular rates (M, 3) in body axes at M stamps."""
+        ...
+
+    def felt_at(self, stamps_ns: NDArray[np.int64]) -> Array:
+        """Return specific force and change of the rate (M, 6) about M stamps, body axes, m/s^2 and rad/s^2; means, so that a hull may vibrate."""
+        ...
+
+    @property
+    def gravity_mps2(self) -> Array:
+        """What is to be added to a specific force (3,), world axes, m/s^2; zero where the driver has done so."""
         ...
 
     def bias_steps(self, dt_s: float) -> Array:

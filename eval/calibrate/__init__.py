@@ -126,7 +126,11 @@ def _suggestion(
     unit, factor = _UNIT[name[1]]
     action = "measure it, then set it"
     block = config.sensors[name[0]]
-    if name[1] == "time" and isinstance(block, GnssConfig | AerialConfig) and block.stamp_sigma_s > 0.0:
+    if (
+        name[1] == "time"
+        and isinstance(block, GnssConfig | VelocityConfig | AerialConfig)
+        and block.stamp_sigma_s > 0.0
+    ):
         action = "the track has it in it already, by stamp_sigma_s"
         if taken_s is not None and abs(found.value - taken_s) > _MUCH_LESS * abs(found.value):
             action = f"the track has {taken_s:+.2g} s of it in it, by stamp_sigma_s; measure it, then set it"

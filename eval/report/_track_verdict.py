@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphloc.chi2 import SIGMAS_95, chi2_95
-from graphloc.config import AerialConfig, GnssConfig
+from graphloc.config import AerialConfig, GnssConfig, VelocityConfig
 from graphloc.eval.formatting import percent
 from graphloc.eval.metrics import Table, errors, held_out_errors, receiver_errors, squared_over_covariance
 from graphloc.eval.report._data import ReportData
@@ -172,13 +172,15 @@ def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Yield suggested time offsets of position sensors that move the track by more than its bounds."""
+    """Yield suggested time offsets of position sensors that move the track, and of velocities that turn it, by more than its bounds."""
     track = solution.trajectory
     if data.calibration is None or track.cov is None or track.v_world_mps is None:
         return
     speed_mps, bound_m = rms(_away(track.v_world_mps)), float(np.median(bounds_95(track.cov)[:, 0]))
     for found in data.calibration.suggestions:
         off_s, block = abs(found.suggested - found.configured), data.config.sensors[found.sensor]
+        if isinstance(block, VelocityConfig) and found.unit == "s" and block.stamp_sigma_s == 0.0:
+            yield from _late_velocity(found.sensor, off_s, solution)
         if isinstance(block, GnssConfig | AerialConfig) and block.stamp_sigma_s > 0.0:
             taken_s = solution.time_offsets_s.get(found.sensor)
             if isinstance(block, GnssConfig) or taken_s is None:
@@ -190,6 +192,23 @@ def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
                 text=f"{found.sensor} and the IMU are {off_s:.2g} s apart (Calibration, below): at this run's {speed_mps:.1f} m/s the "
                 f"track is up to {off_s * speed_mps:.2f} m behind or ahead, which its bounds of {bound_m:.2f} m (median) do not include.",
             )
+
+
+def _late_velocity(sensor: str, off_s: float, solution: Solution) -> Iterator[Reason]:
+    """Yield a velocity whose delay turns the heading by more than its bounds: by as much as the accelerations turn meanwhile, on average."""
+    track = solution.trajectory
+    assert track.cov is not None
+    assert track.v_world_mps is not None
+    gained = np.gradient(track.v_world_mps[:, :2], track.stamps_ns * 1e-9, axis=0)
+    power = (gained**2).sum(axis=1)
+    turned_deg = abs(float(np.degrees(off_s * (power @ solution.gyro_radps[:, 2]) / max(power.sum(), 1e-9))))
+    bound_deg = float(np.median(bounds_95(track.cov)[:, 2]))
+    if turned_deg > bound_deg:
+        yield Reason(
+            trust=Trust.WITH_CARE,
+            text=f"{sensor} and the IMU are {off_s:.2g} s apart (Calibration, below): as this run turns, the heading is about "
+            f"{turned_deg:.1f} deg off where it comes from the motion, which its bounds of {bound_deg:.1f} deg (median) do not include.",
+        )
 
 
 def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:

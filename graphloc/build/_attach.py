@@ -13,7 +13,7 @@ from graphloc import keys
 from graphloc.build._chains import walk_between_nodes
 from graphloc.config import VesselConfig
 from graphloc.frames import Array, Datum
-from graphloc.graph import Attachment, Constant, Sensor, SlowProcess
+from graphloc.graph import TIME_OFFSET, Attachment, Constant, FeltMotion, InertialLink, Sensor, SlowProcess
 from graphloc.measurements import Measurement
 
 Carry = tuple[int, Any]
@@ -58,6 +58,11 @@ class Sited(Protocol):
     @property
     def datum(self) -> Datum:
         """Origin of world."""
+        ...
+
+    @property
+    def links(self) -> InertialLink:
+        """Of the IMU."""
         ...
 
     @property
@@ -110,6 +115,11 @@ class Attaching(Protocol):
         ...
 
     @property
+    def felt(self) -> Any:
+        """Raw specific force and change of the rate about each measurement (6,), m/s^2 and rad/s^2, body axes."""
+        ...
+
+    @property
     def apart_s(self) -> Any:
         """Time since the measurement before, s; inf for the first."""
         ...
@@ -157,12 +167,13 @@ def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> A
     T = values.atPose3(keys.pose(k))
     v = values.atVector(keys.velocity(k))
     bias = values.atConstantBias(keys.bias(j))
-    T_state_sensor, dv = stream.mount, np.zeros(3)
+    T_state_sensor, dv, turn = stream.mount, np.zeros(3), np.eye(3)
     carried = stream.carry[i]
     if carried is not None:
         floor, pim = carried
         there = pim.predict(nav_state(values, floor), bias)
-        T_state_sensor = T.between(there.pose()).compose(stream.mount)
+        carried_to = T.between(there.pose())
+        T_state_sensor, turn = carried_to.compose(stream.mount), carried_to.rotation().matrix()
         dv = np.asarray(there.velocity()) - v
     slow_key = None if stream.slow is None else keys.slow(stream.number, j)
     return Attachment(
@@ -182,7 +193,19 @@ def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> A
         slow_age_s=max(int(stream.measurements[i].stamp_ns) - int(problem.timeline.slow_stamps_ns[j]), 0) * 1e-9,
         slow_walk=_slow_walk(problem, stream, i),
         constants=constants_of(stream, values),
+        felt=_felt(problem, stream.felt[i], turn, bias) if asks_for_delay(stream) else None,
     )
+
+
+def asks_for_delay(stream: Attaching) -> bool:
+    """Return whether the delay of a sensor's stamps is one of its constants."""
+    return any(TIME_OFFSET in constant.corrects for constant in stream.constants)
+
+
+def _felt(problem: Sited, raw: Array, turn: Array, bias: Any) -> FeltMotion:
+    """Return what the IMU feels; `turn` (3, 3): from the body at the measurement to that at the state."""
+    force = raw[:3] - problem.R_body_imu @ bias.accelerometer()
+    return FeltMotion(turn @ force, turn @ raw[3:], problem.links.gravity_mps2)
 
 
 def _slow_walk(problem: Sited, stream: Attaching, i: int) -> Array | None:

@@ -132,6 +132,7 @@ def _streams(
                 state=state,
                 carry=carry,
                 gyro_radps=problem.links.gyro_at(stamps_of(own)),
+                felt=problem.links.felt_at(stamps_of(own)),
                 apart_s=apart_s_of(own),
             )
         )

@@ -41,7 +41,7 @@ class Stream:
         mount: pose of the sensor from the IMU, body axes.
         measurements: M of them by stamp. state: (M,) the state of each (`state_of`). carry: for each, the preintegrated motion
             from the state before it; None where its stamp is that of a state.
-        gyro_radps: (M, 3) raw rate at each measurement, body axes.
+        gyro_radps: (M, 3) raw rate at each measurement, body axes. felt: (M, 6) raw specific force and change of the rate about it.
         apart_s: (M,) time since the measurement before; inf for the first.
         usual: at which slow nodes (N,) its error is at its usual level; None: not known (see `solve/_levels.py`).
     """
@@ -59,6 +59,7 @@ class Stream:
     state: NDArray[np.int64]
     carry: tuple[Carry | None, ...]
     gyro_radps: Array
+    felt: Array
     apart_s: Array
     usual: NDArray[np.bool_] | None = None
 
@@ -71,7 +72,13 @@ class Stream:
         """Return it without its measurements."""
         none = np.empty(0)
         return replace(
-            self, measurements=(), state=none.astype(np.int64), carry=(), gyro_radps=np.empty((0, 3)), apart_s=none
+            self,
+            measurements=(),
+            state=none.astype(np.int64),
+            carry=(),
+            gyro_radps=np.empty((0, 3)),
+            felt=np.empty((0, 6)),
+            apart_s=none,
         )
 
 
@@ -189,14 +196,16 @@ def without_sensor(problem: Problem, stream: Stream) -> Problem:
 
 def _carried_anew(stream: Stream, timeline: Timeline, links: InertialLink, after_ns: int, until_ns: int) -> Stream:
     """Return a stream whose measurements in a span are carried from their states by these links."""
-    zero, carry, gyro = gtsam.imuBias.ConstantBias(), list(stream.carry), np.array(stream.gyro_radps)
+    zero, carry = gtsam.imuBias.ConstantBias(), list(stream.carry)
+    gyro, felt = np.array(stream.gyro_radps), np.array(stream.felt)
     for i, (m, carried) in enumerate(zip(stream.measurements, carry, strict=True)):
         if after_ns < m.stamp_ns <= until_ns:
-            gyro[i] = links.gyro_at(np.array([m.stamp_ns]))[0]
+            stamps_ns = np.array([m.stamp_ns])
+            gyro[i], felt[i] = links.gyro_at(stamps_ns)[0], links.felt_at(stamps_ns)[0]
             if carried is not None:
                 at_ns = int(timeline.stamps_ns[carried[0]])
                 carry[i] = carried[0], links.integrate(at_ns, m.stamp_ns, zero)
-    return replace(stream, carry=tuple(carry), gyro_radps=gyro)
+    return replace(stream, carry=tuple(carry), gyro_radps=gyro, felt=felt)
 
 
 def with_links(problem: Problem, preintegrated: tuple[Any, ...]) -> Problem:

@@ -112,6 +112,7 @@ def _thin(stream: Stream, indices: NDArray[np.int64], states: NDArray[np.int64])
         state=np.searchsorted(states, stream.state[indices]),
         carry=tuple(None if c is None else (int(np.searchsorted(states, c[0])), c[1]) for c in carried),
         gyro_radps=stream.gyro_radps[indices],
+        felt=stream.felt[indices],
         apart_s=apart_s_of(measurements),
     )
 

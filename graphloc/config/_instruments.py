@@ -190,6 +190,9 @@ class VelocityConfig(SensorConfig):
     """Floor of the velocity sigma, m/s."""
     default_sigma_mps: Positive = 0.3
     """Sigma if the message reports no covariance, m/s."""
+    stamp_sigma_s: NonNegative = 0.0
+    """Unknown delay of its stamps beyond `time_offset_s`, 1 sigma, s; as that of `gnss`. A late velocity turns the heading where that comes
+    from the motion: 0.1 s by as much as the vessel turns in 0.1 s."""
     mount_sigma_m: NonNegative = 0.0
     """Unknown error of where its antenna is taken to sit, 1 sigma, each axis, m; as that of `gnss`."""
     nmea: Velocities = ("VTG",)

@@ -179,6 +179,7 @@ class LiveStream:
     state: Tape[int] = field(default_factory=Tape)
     carry: Tape[Carry | None] = field(default_factory=Tape)
     gyro_radps: Tape[Array] = field(default_factory=Tape)
+    felt: Tape[Array] = field(default_factory=Tape)
     apart_s: Tape[float] = field(default_factory=Tape)
     by_stamp: list[tuple[int, int]] = field(default_factory=list)
     scatter: Scatter = field(default_factory=Scatter)
@@ -213,7 +214,7 @@ class LiveStream:
     def forget(self, before: int) -> None:
         """Forget the measurements before an index."""
         self.by_stamp = [taken for taken in self.by_stamp if taken[1] >= before]
-        for tape in (self.measurements, self.state, self.carry, self.gyro_radps, self.apart_s):
+        for tape in (self.measurements, self.state, self.carry, self.gyro_radps, self.felt, self.apart_s):
             tape.forget(before)
 
     def jumped(self, after_ns: int, until_ns: int) -> tuple[float, Array | None]:
@@ -243,7 +244,7 @@ class LiveProblem:
     def take(self, m: Measurement) -> tuple[LiveStream, int]:
         """Attach a measurement to its state; return its stream and its index there."""
         stream = self.streams[m.sensor]
-        carry, gyro_radps = self._motion(m.stamp_ns)
+        carry, gyro_radps, felt = self._motion(m.stamp_ns)
         timeline = self.timeline
         floor, nearest = timeline.floor(m.stamp_ns), timeline.nearest(m.stamp_ns)
         stream.measurements.append(m)
@@ -251,20 +252,24 @@ class LiveProblem:
         stream.state.append(state_of(m, floor, nearest, timeline.stamps_ns, self.links.gaps()))
         stream.carry.append(carry)
         stream.gyro_radps.append(gyro_radps)
+        stream.felt.append(felt)
         return stream, len(stream.measurements) - 1
 
     def reintegrate(self, stream: LiveStream, index: int) -> None:
         """Integrate again from the state before a measurement to its stamp: samples in between came late."""
-        stream.carry[index], stream.gyro_radps[index] = self._motion(stream.measurements[index].stamp_ns)
+        stream.carry[index], stream.gyro_radps[index], stream.felt[index] = self._motion(
+            stream.measurements[index].stamp_ns
+        )
 
-    def _motion(self, stamp_ns: int) -> tuple[Carry | None, Array]:
-        """Return the motion from the state before a stamp to it (None at a state), and the raw angular rate there (3,), rad/s."""
+    def _motion(self, stamp_ns: int) -> tuple[Carry | None, Array, Array]:
+        """Return the motion from the state before a stamp to it (None at a state), the raw angular rate there (3,), rad/s, and what is felt (6,)."""
         floor = self.timeline.floor(stamp_ns)
         at_ns = self.timeline.stamps_ns[floor]
         carry = None
         if stamp_ns > at_ns:
             carry = (floor, self.links.integrate(at_ns, stamp_ns, gtsam.imuBias.ConstantBias()))
-        return carry, self.links.gyro_at(np.array([stamp_ns]))[0]
+        stamps_ns = np.array([stamp_ns])
+        return carry, self.links.gyro_at(stamps_ns)[0], self.links.felt_at(stamps_ns)[0]
 
 
 def live_problem(

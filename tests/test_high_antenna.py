@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A delay of fixes by what the IMU feels, where waves tilt the IMU and swing an antenna on a mast whose height nobody told."""
+
+import numpy as np
+import pytest
+
+from graphloc.frontends._assess import MeasuredMotion
+from graphloc.frontends._mount_yaw import Felt
+from graphloc.frontends._time_offsets import MotionOffset, motion_time_offset
+
+G = 9.81
+
+
+def found(late_s: float, height_m: float, way: float = 1.0) -> MotionOffset | None:
+    """A vessel that goes ahead at changing speed, pitches by 2 deg in waves and surges a quarter of a wave away from that."""
+    rng, t = np.random.default_rng(3), np.arange(0.0, 180.0, 0.01)
+
+    def pitch(t: np.ndarray) -> np.ndarray:
+        return 0.03 * np.sin(1.5 * t) + 0.02 * np.sin(1.1 * t + 1.0)
+
+    def place(t: np.ndarray) -> np.ndarray:
+        surge = way * (0.3 * np.cos(1.5 * t) / 1.5 + 0.2 * np.cos(1.1 * t + 1.0) / 1.1)
+        return np.asarray(5.0 * t + 30.0 * np.sin(0.12 * t) + surge)
+
+    dt = 1e-3
+    force = (place(t + dt) - 2.0 * place(t) + place(t - dt)) / dt**2
+    rate = (pitch(t + dt) - pitch(t - dt)) / (2.0 * dt)
+    zero, stamps = np.zeros(len(t)), (t * 1e9).astype(np.int64)
+    accel = np.column_stack([force - G * np.sin(pitch(t)), zero, zero + G]) + 0.02 * rng.normal(size=(len(t), 3))
+    felt = Felt.of(stamps, accel, np.column_stack([zero, rate, zero]) + 0.001 * rng.normal(size=(len(t), 3)), G)
+    at = np.arange(0.0, 180.0, 0.2)
+    measured = place(at) + height_m * np.sin(pitch(at)) + 0.02 * rng.normal(size=len(at))
+    return motion_time_offset(felt, MeasuredMotion("fixes", 0, at + late_s, np.full(len(at), 5.0), measured + 0j))
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+@pytest.mark.parametrize("height_m", [0.0, 8.0])
+@pytest.mark.parametrize("late_s", [0.0, 0.3])
+def test_a_delay_is_told_apart_from_waves(late_s: float, height_m: float, way: float) -> None:
+    """Taken without the swing of the mast, fixes in time looked late or early, clearly."""
+    offset = found(late_s, height_m, way)
+    assert offset is not None
+    assert offset.clear == (late_s > 0.0)
+    assert offset.value_s == pytest.approx(-late_s, abs=max(3.0 * offset.sigma_s, 0.03))
