@@ -22,6 +22,7 @@ _CLEAR, _HINT, _LEAST_S = 4.0, 2.0, 0.02  # sigmas, s
 _BY_CHANCE = 5e-3  # a few blocks that agree by chance look like many
 _APART_S, _LEAST_OF_WAY_S = 0.05, 0.1  # how closely is looked; from which it is said
 _STEPS = 3  # to an offset of a second in the sharpest turns
+_HIGH_M = 10.0  # 1 sigma of how high above the IMU an antenna is
 _CHORD_S = 2.0  # half the time of a chord of fixes, and of a velocity's integral
 
 
@@ -103,7 +104,7 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
     """Return by how much the stamps of a motion are off, by the accelerometer; None if that does not show it.
 
     Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. Pitch swings a high
-    antenna along it, so its height is estimated with the offset: c is the correlation with what is felt and that swing together. With
+    antenna along it, so its height (0 m, give or take ten) is estimated with the offset: c is the correlation with what is felt and that swing together. With
     c at the best offset and c0 at none, N (c^2 - c0^2) / (1 - c^2) is the gain in chi-square over N windows.
 
     Args:
@@ -124,7 +125,10 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
             continue
         middle = middle[good]
         along = (moved * np.conj(chord / np.maximum(np.abs(chord), MOVES_M)))[good].real
-        c = np.array([_explained(along, *_felt_along(felt, middle + lag, half_s)) for lag in lags])
+        parts = [_felt_along(felt, middle + lag, half_s) for lag in lags]
+        alone = max(_explained(along, own, swung, np.inf) for own, swung in parts)
+        held = (1.0 - alone**2) * float(along.var()) * len(along) / windows / _HIGH_M**2
+        c = np.array([_explained(along, *part, held) for part in parts])
         k = int(c.argmax())
         bend = 0.0 if k in (0, len(c) - 1) else float(2.0 * c[k] - c[k - 1] - c[k + 1]) / _APART_S**2
         if bend <= 0.0 or c[k] <= 0.0:
@@ -170,9 +174,14 @@ def _felt_along(felt: Felt, middle_s: Array, half_s: float) -> tuple[Array, Arra
     return (moved * ahead).real, (swung * ahead).real
 
 
-def _explained(along: Array, felt: Array, swung: Array) -> float:
-    """Return the correlation of an acceleration with what is felt and an unknown share of a swing; 0 where it is the opposite of what is felt."""
+def _explained(along: Array, felt: Array, swung: Array, held: float) -> float:
+    """Return the correlation of an acceleration with what is felt and some of a swing; 0 where it is the opposite of what is felt.
+
+    Args:
+        held: what the square of that share costs, beside squares of the acceleration.
+    """
     y, X = along - along.mean(), np.column_stack([felt - felt.mean(), swung - swung.mean()])
-    share = np.linalg.lstsq(X, y, rcond=None)[0]
+    X = X[:, :1] if np.isinf(held) else X
+    share = np.linalg.lstsq(X.T @ X + np.diag([0.0, held])[: X.shape[1], : X.shape[1]], X.T @ y, rcond=None)[0]
     power = float(y @ y)
     return float(np.sqrt(max(share @ X.T @ y, 0.0) / power)) if power > 0.0 and share[0] > 0.0 else 0.0
