@@ -47,13 +47,16 @@ MEAN_S = 30.0
 
 
 def only_position_sensor(stream: Any, absolute: Collection[Any]) -> bool:
-    """Return whether this stream is the only one that measures position, and no slow error that drifts is estimated with it.
+    """Return whether this stream is the only one that measures position, and may jump.
+
+    Beside a sensor of velocity, too: its slow error is then estimated, but a window follows a jump that its steps do not allow for,
+    as no other sensor holds the place.
 
     Args:
         absolute: the absolute streams of the run.
     """
     alone = len(absolute) == 1 and stream.row.absolute and stream.row.false is None
-    return bool(alone and (stream.slow is None or stream.left_out is not None))
+    return bool(alone and (stream.slow is None or stream.left_out is not None or stream.slow.jumps))
 
 
 def position_jumps(
@@ -134,13 +137,13 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
     return stamps_ns[at + n], size_m[at]
 
 
-def allowed_jump_m(left_out: SlowProcess | None) -> float:
+def allowed_jump_m(slow: SlowProcess | None) -> float:
     """Return the size (m) up to which the bounds include a jump.
 
     Args:
-        left_out: the slow error (east, north, ...) of a receiver that is added to the bounds; None: none is.
+        slow: the slow error (east, north, ...) of a receiver, estimated or added to the bounds; None: it has none.
     """
-    return 0.0 if left_out is None else float(_IN_BOUNDS * left_out.sigma[:2].max())
+    return 0.0 if slow is None else float(_IN_BOUNDS * slow.sigma[:2].max())
 
 
 def _parts(steps_m: Array) -> Array:

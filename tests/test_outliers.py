@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from graphloc import app, keys
 from graphloc.build import Problem, Stream, jumping, make_problem
-from graphloc.config import KernelConfig, SlowErrorConfig, VesselConfig
+from graphloc.config import KernelConfig, SlowErrorConfig, VelocityConfig, VesselConfig
 from graphloc.errors import SolveError
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.graph import Residual
-from graphloc.measurements import CompassHeading, GnssPosition, Measurement
+from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, Measurement
 from graphloc.online import OnlineSmoother
 from graphloc.online import _start as online_start
 from graphloc.position_jumps import (
@@ -767,6 +767,31 @@ def test_a_wrong_fix_of_rtk_is_not_followed(off_m: float) -> None:
         assert off.coverage_95 is not None
         assert off.coverage_95 > 0.95
         assert any("gnss: position jump of" in w and "treated as its error" in w for w in found.stats.warnings)
+
+
+def test_a_wrong_fix_of_rtk_is_not_followed_beside_its_velocity() -> None:
+    """2 m for 15 s, velocities of 0.3 m/s (as where none is stated): online all bent to the fixes, in 3 s, and was good within 0.3 m."""
+    slow = SlowErrorConfig(horizontal_sigma_m=0.03, vertical_sigma_m=0.06)
+    run, recording, config = jumping_alone(5.0, (25.0, 40.0), 45.0, off_m=2.0, sigma_m=0.01, slow=slow)
+    stamps_ns = np.arange(run.truth.stamps_ns[0], run.truth.stamps_ns[-1], 200_000_000)
+    v_mps = run.truth.at(stamps_ns).v_world_mps + np.random.default_rng(2).normal(0.0, 0.05, (len(stamps_ns), 3))
+    velocities = [
+        GnssVelocity(sensor="velocity", seq=10**7 + n, stamp_ns=at_ns, v_world_mps=v, cov_m2ps2=0.09 * np.eye(3))
+        for n, (at_ns, v) in enumerate(zip(stamps_ns.tolist(), v_mps, strict=True))
+    ]
+    recording = replace(
+        recording,
+        measurements=tuple(sorted((*recording.measurements, *velocities), key=lambda m: (m.stamp_ns, m.seq))),
+        topics={**recording.topics, "velocity": "/velocity"},
+    )
+    sensors = {**config.sensors, "velocity": VelocityConfig(kind="gnss_velocity", topic="/velocity")}
+    live = replay(recording, config.model_copy(update={"sensors": sensors})).solution
+    off = compare_to_truth(live.trajectory, run.truth)
+    assert off.position_max_m < 1.5  # until the jump is detected, a second later
+    assert off.position_rmse_m < 0.3
+    assert any("gnss: position jump of 2 m" in w and "treated as its error" in w for w in live.stats.warnings)
+    wrong = live.trajectory.stamps_ns > run.truth.stamps_ns[0] + 27_000_000_000
+    assert Health.GOOD not in [h for h, k in zip(live.health, wrong, strict=True) if k]
 
 
 def jumping_alone(

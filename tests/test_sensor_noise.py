@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graphloc import app
+from graphloc import app, origin
+from graphloc.build import make_problem
 from graphloc.config import GnssConfig, PoseConfig
 from graphloc.eval.metrics import compare_to_truth
-from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic
 from graphloc.graph import Residual
@@ -27,6 +28,7 @@ from graphloc.online._scatter import Scatter
 from graphloc.online._sensor_noise import SensorNoise
 from graphloc.online._snapshot import Snapshot
 from graphloc.replay import arrivals, replay
+from graphloc.solve._batch import solve_batch
 from graphloc.solve._sensor_noise import Pair, Step, times_stated
 from graphloc.time import stamps_of
 from tests.faults import Fed, arrivals_of, feed
@@ -174,6 +176,20 @@ def test_fixes_that_state_a_tenth_of_their_noise_are_taken_as_they_scatter() -> 
     assert float(said.rsplit(" ", 1)[1]) == pytest.approx(10.0, rel=0.2)
     assert not [w for w in solution.stats.warnings if "IMU" in w]
     assert compare_to_truth(solution.trajectory, run.truth).position_rmse_m < 0.3
+
+
+def test_a_start_by_the_motion_blames_fixes_that_scatter() -> None:
+    """Fixes of 0.8 m at 1 Hz that state an eighth, no compass: so few do not tell surely, and the IMU contradicted them."""
+    scenario = Scenario(
+        path="loops", duration_s=25.0, noise="clean", pose_hz=0.0, compass_hz=0.0, imu_hz=50.0, gnss_hz=1.0, gnss_sigma_m=0.8
+    )  # fmt: skip
+    run = stating(slowly(simulate(scenario, 3)), GnssPosition, 0.125)
+    datum = origin.choose_datum(run.recording, run.config, SENSORS)
+    found = solve_batch(make_problem(run.recording, run.config, datum, SENSORS, INERTIAL), newest=True)
+    (gnss,) = found.problem.streams
+    times = found.problem.config.sensors[gnss.name].sigmas_over(run.config.sensors[gnss.name])
+    assert times == {"sigma_scale": pytest.approx(8.0, rel=0.3)}
+    assert found.noise_scale == 1.0
 
 
 def test_a_pose_has_a_factor_on_lengths_and_one_on_angles() -> None:

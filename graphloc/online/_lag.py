@@ -243,7 +243,7 @@ class Lag:
     def unmodelled_jumps(self) -> list[str]:
         """Names of the receivers that have jumped since the window was built, where the window can estimate that as their error."""
         streams = self.problem.streams.items()
-        return [n for n, s in streams if s.left_out is not None and s.receiver.jump.jumps != s.jumps]
+        return [n for n, s in streams if s.may_jump and s.receiver.jump.jumps != s.jumps]
 
     def in_doubt(self, stamp_ns: int) -> str:
         """Return why the health cannot be good at a stamp: the only position sensor has jumped, or scans are stamped far off; empty where neither is."""

@@ -193,6 +193,11 @@ class LiveStream:
         return self.frozen_detector.frozen or self.receiver.repeated_fix.frozen
 
     @property
+    def may_jump(self) -> bool:
+        """Whether position jumps of the receiver can be estimated as its slow error."""
+        return self.left_out is not None or (self.slow is not None and self.slow.jumps)
+
+    @property
     def noisier(self) -> float:
         """Factor on its stated sigma; 1 for positions, whose scatter may be that of the estimate."""
         return 1.0 if self.row.absolute else self.scatter.noisier
@@ -318,7 +323,7 @@ def live_problem(
             receiver=receiver,
             jumps=receiver.jump.jumps,
         )
-    jumps_ns = [jump.after_ns for stream in streams.values() if stream.left_out is not None for jump in stream.jumps]
+    jumps_ns = [jump.after_ns for stream in streams.values() if stream.may_jump for jump in stream.jumps]
     return LiveProblem(
         config=config,
         datum=datum,

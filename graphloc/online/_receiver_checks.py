@@ -112,10 +112,9 @@ class ReceiverChecks:
         self, stream: LiveStream, stamp_ns: int, told_m: Array, sigma_m: float, off: OffPrediction | None
     ) -> None:
         if only_position_sensor(stream, [s for s in self._problem.streams.values() if s.row.absolute]):
-            allowed = stream.left_out is not None
-            found = stream.receiver.jump.note(
-                stamp_ns, told_m, sigma_m, allowed_m=allowed_jump_m(stream.left_out), off=off
-            )
+            slow = stream.left_out or stream.slow
+            allowed = slow is not None
+            found = stream.receiver.jump.note(stamp_ns, told_m, sigma_m, allowed_m=allowed_jump_m(slow), off=off)
             self._warnings += jump_warnings(stream.name, *found, allowed=allowed, followed=not allowed)
 
     def _reject_since(self, stream: LiveStream, since_ns: int, until_ns: int) -> None:

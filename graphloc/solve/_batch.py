@@ -128,6 +128,14 @@ def solve_batch(
         SolveError: it could not be started, or the linear algebra failed.
     """
     begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu)
+    if begun.start.by_motion and solved.misfit() >= CONTRADICTION:
+        # By the motion alone a start bends everything to fixes that state too little, and the IMU would be called noisier.
+        times = scattering(solved.problem, solved.settled.verdicts, denied=True)
+        if times:
+            scattered = replace(with_sensor_noise(solved.problem, times), usual_motion=None)
+            del solved
+            again = solve_batch(scattered, progress, newest=newest, doubt_imu=doubt_imu)
+            return replace(again, stated=with_jumps_of(again.stated, problem))
     for _ in range(0 if newest else _MAX_JUMP_ROUNDS):
         if (jumping := with_jumps_off_track(problem, solved.settled.verdicts)) is None:
             break

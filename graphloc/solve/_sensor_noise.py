@@ -31,6 +31,7 @@ _ERRORS = (0.2, 0.4, 0.8, 1.6, 3.2)  # times the error that is expected of a fal
 _ANY_SIZE = 0.1  # share of the others that err by any of these sizes, and not by the one of most
 _LEAST_TIMES = 1.4
 _SURE = 8.0  # log-likelihood that a factor must gain
+_SURE_IF_DENIED = 0.0  # where the IMU contradicts the sensors: half a minute of fixes tells no more, and else it would be called noisier
 
 
 class Step(NamedTuple):
@@ -51,12 +52,17 @@ Pair = tuple[Step, ...]
 """Two residuals in a row: their steps, one of each key."""
 
 
-def scattering(problem: Problem, verdicts: Verdicts) -> dict[str, dict[str, float]]:
-    """Return by what factors fixes, poses and matches scatter more than they state, where clearly: by sensor and key of its configuration."""
+def scattering(problem: Problem, verdicts: Verdicts, *, denied: bool = False) -> dict[str, dict[str, float]]:
+    """Return by what factors fixes, poses and matches scatter more than they state, where clearly: by sensor and key of its configuration.
+
+    Args:
+        denied: whether the IMU contradicts the sensors, so that one of them is noisier than configured.
+    """
     found = {}
     for stream in problem.streams:
         judged = [verdicts[stream.number, i].residual for i in range(len(stream.measurements))]
-        if times := times_stated(pairs_of(stream, zip(stream.measurements, judged, strict=True))):
+        pairs = pairs_of(stream, zip(stream.measurements, judged, strict=True))
+        if times := times_stated(pairs, sure=_SURE_IF_DENIED if denied else _SURE):
             found[stream.name] = times
     return found
 
@@ -85,11 +91,13 @@ def _error(stream: Judged, m: Measurement, axes: int) -> Array:
     return stream.row.false(m, stream.config).cov
 
 
-def times_stated(pairs: Iterable[Pair], now: Mapping[str, float] | None = None) -> dict[str, float]:
+def times_stated(
+    pairs: Iterable[Pair], now: Mapping[str, float] | None = None, *, sure: float = _SURE
+) -> dict[str, float]:
     """Return by key how many times its stated sigma a sensor scatters, where it is clearly more.
 
     Args:
-        now: factors that are taken now; they stay, but where others are clearly likelier.
+        now: factors that are taken now; they stay, but where others are clearly likelier. sure: log-likelihood that others must gain.
     """
     alike: dict[tuple[tuple[str, int], ...], list[Pair]] = {}  # with and without height, with and without heading
     for pair in pairs:
@@ -103,11 +111,11 @@ def times_stated(pairs: Iterable[Pair], now: Mapping[str, float] | None = None) 
     parts = [
         [np.array(part) for part in zip(*(step[1:] for step in own), strict=True)] for own in zip(*some, strict=True)
     ]
-    times = dict(zip(keys, _likeliest(parts, [now.get(key, 1.0) for key in keys]), strict=True))
+    times = dict(zip(keys, _likeliest(parts, [now.get(key, 1.0) for key in keys], sure), strict=True))
     return {key: by for key, by in {**now, **times}.items() if by > 1.0}
 
 
-def _likeliest(steps: Sequence[Sequence[Array]], now: Sequence[float]) -> list[float]:
+def _likeliest(steps: Sequence[Sequence[Array]], now: Sequence[float], sure: float) -> list[float]:
     """Return the likeliest factor on the stated sigmas of M steps, of each key; what it is now where no other is clearly likelier.
 
     Keys share which pairs are right: where positions tell false ones, the angles of the others show their noise. How far most of the
@@ -115,7 +123,7 @@ def _likeliest(steps: Sequence[Sequence[Array]], now: Sequence[float]) -> list[f
 
     Args:
         steps: of each key, its changes, stated covariances and errors (see `Step`), each with one more axis (M) in front.
-        now: factor of each key.
+        now: factor of each key. sure: log-likelihood that another must gain.
     """
     right, other = np.zeros((1, len(steps[0][0]))), np.zeros(len(steps[0][0]))  # (factors of each key, M), (M,)
     tried = [_factors(times) for times in now]
@@ -132,7 +140,7 @@ def _likeliest(steps: Sequence[Sequence[Array]], now: Sequence[float]) -> list[f
     for axis, (k, times, factors) in enumerate(zip(at, now, tried, strict=True)):
         as_now = (*at[:axis], int(np.argmin(np.abs(np.log(factors / times)))), *at[axis + 1 :])
         # Two steps in a row have a residual in common, so each counts half.
-        clear = 0.5 * (likely[at] - likely[as_now]) > _SURE
+        clear = 0.5 * (likely[at] - likely[as_now]) > sure
         found.append(times if not clear else float(factors[k]) if factors[k] > _LEAST_TIMES else 1.0)
     return found
 
