@@ -774,7 +774,9 @@ def test_a_wrong_fix_of_rtk_is_not_followed_beside_its_velocity() -> None:
     slow = SlowErrorConfig(horizontal_sigma_m=0.03, vertical_sigma_m=0.06)
     run, recording, config = jumping_alone(5.0, (25.0, 40.0), 45.0, off_m=2.0, sigma_m=0.01, slow=slow)
     stamps_ns = np.arange(run.truth.stamps_ns[0], run.truth.stamps_ns[-1], 200_000_000)
-    v_mps = run.truth.at(stamps_ns).v_world_mps + np.random.default_rng(2).normal(0.0, 0.05, (len(stamps_ns), 3))
+    true_mps = run.truth.at(stamps_ns).v_world_mps
+    assert true_mps is not None
+    v_mps = true_mps + np.random.default_rng(2).normal(0.0, 0.05, (len(stamps_ns), 3))
     velocities = [
         GnssVelocity(sensor="velocity", seq=10**7 + n, stamp_ns=at_ns, v_world_mps=v, cov_m2ps2=0.09 * np.eye(3))
         for n, (at_ns, v) in enumerate(zip(stamps_ns.tolist(), v_mps, strict=True))

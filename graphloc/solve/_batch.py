@@ -127,15 +127,18 @@ def solve_batch(
         ImuWrong: there are some.
         SolveError: it could not be started, or the linear algebra failed.
     """
+    configured = problem
     begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu)
-    if begun.start.by_motion and solved.misfit() >= CONTRADICTION:
+    for _ in range(_MAX_SENSOR_ROUNDS):
+        if not begun.start.by_motion or solved.misfit() < CONTRADICTION:
+            break
         # By the motion alone a start bends everything to fixes that state too little, and the IMU would be called noisier.
         times = scattering(solved.problem, solved.settled.verdicts, denied=True)
-        if times:
-            scattered = replace(with_sensor_noise(solved.problem, times), usual_motion=None)
-            del solved
-            again = solve_batch(scattered, progress, newest=newest, doubt_imu=doubt_imu)
-            return replace(again, stated=with_jumps_of(again.stated, problem))
+        if not times:
+            break
+        problem = replace(with_sensor_noise(solved.problem, times), usual_motion=None)
+        del solved  # and its graph, before the next one is made
+        begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu)
     for _ in range(0 if newest else _MAX_JUMP_ROUNDS):
         if (jumping := with_jumps_off_track(problem, solved.settled.verdicts)) is None:
             break
@@ -152,7 +155,7 @@ def solve_batch(
             solved = choice.settled_again(begun.prior, progress)
             break
         problem = jumping
-    stated = problem
+    stated = with_jumps_of(problem, configured)
     mount = None
     if not newest:
         solved, prior, mount = solved.with_mount_estimated(begun.prior, progress)

@@ -44,6 +44,8 @@ def with_jumps_off_track(problem: Problem, verdicts: Verdicts) -> Problem | None
 
 def with_jumps_of(solved: Problem, problem: Problem) -> Problem:
     """Return a problem with the position jumps, and the slow errors that these make states, with which it was solved."""
+    if solved is problem:
+        return problem
     jumps = ((s.slow, s.left_out, s.position_jumps) for s in solved.streams)
     streams = (
         replace(stream, slow=slow, left_out=left_out, position_jumps=found)
