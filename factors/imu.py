@@ -222,6 +222,12 @@ class Links:
         """Return the raw specific force, m/s^2, and the change of the rate, rad/s^2 (M, 6), in body axes, each by means over 0.2 s."""
         stamps = self._stamps
         begin, end = (np.clip(stamps_ns + side, stamps[0], stamps[-1]) for side in (-_ABOUT_NS, _ABOUT_NS))
+        beyond = begin == end
+        # At the ends of the data half of that at least: of a few samples that vibrate, the change of the rate is off by rad/s^2.
+        begin, end = (
+            np.maximum(np.minimum(begin, end - _ABOUT_NS), stamps[0]),
+            np.minimum(np.maximum(end, begin + _ABOUT_NS), stamps[-1]),
+        )
         first = max(int(np.searchsorted(stamps, begin.min(), side="right")) - 1, 0)
         last = int(np.searchsorted(stamps, end.max(), side="left")) + 1
         t = (stamps[first:last] - stamps[first]) * 1e-9
@@ -230,9 +236,9 @@ class Links:
         before, middle, after = (interpolated(edge, t, sums) for edge in edges)
         span = np.maximum(edges[2] - edges[0], 1e-9)[:, None]
         felt = np.hstack([(after - before)[:, :3] / span, (after - 2.0 * middle + before)[:, 3:] * (2.0 / span) ** 2])
-        outside = span[:, 0] < 1e-10 * _ABOUT_NS
-        felt[outside, 3:] = 0.0  # beyond the data
-        felt[outside, :3] = self._at(stamps_ns[outside])[:, :3]
+        felt[beyond, 3:] = 0.0
+        lone = begin == end  # of a single sample
+        felt[lone, :3] = self._at(stamps_ns[lone])[:, :3]
         return np.asarray((felt.reshape(-1, 2, 3) @ self._R_body_imu.T).reshape(-1, 6))
 
     @property

@@ -160,8 +160,32 @@ def test_what_is_felt_is_a_mean_over_waves_of_the_hull(rate_hz: float) -> None:
     np.testing.assert_allclose(spin @ R, -1.5 * np.sin(1.5 * at)[:, None] * [0.1, 0.05, 0.02], atol=0.02)
     alone = np.array([links.felt_at(np.array([round(s * 1e9)]))[0] for s in at])  # as online
     np.testing.assert_allclose(alone, np.hstack([force, spin]), atol=1e-9)
+    newest = links.felt_at(stamps[-1:])[0]
     after = links.felt_at(np.array([round(25e9)]))[0]
-    np.testing.assert_allclose(after, [*(R @ accel[-1]), 0.0, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(after, [*newest[:3], 0.0, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        R.T @ after[:3], [0.0, 0.0, 9.8] + np.sin(1.5 * t[-1]) * np.array([0.5, 0.2, 1.0]), atol=0.15
+    )
+
+
+@pytest.mark.parametrize("beyond_s", [0.05, 0.09, 5.0])
+def test_what_is_felt_at_the_ends_of_the_data_is_a_mean_too(beyond_s: float) -> None:
+    """Where the IMU fell silent 0.05 s before, it was of five samples, then of one: an engine made it rad/s^2 and m/s^2."""
+    run = simulate(replace(SCENARIO, duration_s=2.0), 1)
+    stamps, rng = np.arange(400) * 10_000_000, np.random.default_rng(4)
+    accel, gyro = rng.normal([0.0, 0.0, 9.8], 2.0, (400, 3)), rng.normal(0.0, 0.1, (400, 3))
+    for begin in range(0, 400, 40):  # ten recordings, so that none is right by chance
+        part = slice(begin, begin + 40)
+        imu = ImuSeries(
+            sensor="imu", stamps_ns=stamps[part], accel_mps2=accel[part], gyro_radps=gyro[part], seqs=np.arange(40)
+        )
+        links = INERTIAL.link(imu, run.config.sensors["imu"], np.eye(3), 9.8)
+        far_ns = round(beyond_s * 1e9)
+        felt = links.felt_at(np.array([imu.stamps_ns[0] - far_ns, imu.stamps_ns[-1] + far_ns]))
+        alone = links.felt_at(np.array([imu.stamps_ns[0] - far_ns]))[0]
+        np.testing.assert_allclose(felt[0], alone, atol=1e-9)
+        assert np.abs(felt[:, :3] - [0.0, 0.0, 9.8]).max() < 2.2
+        assert np.abs(felt[:, 3:]).max() < 3.0
 
 
 @pytest.mark.parametrize("mode", ["offline", "online"])
