@@ -221,12 +221,16 @@ class Links:
     def felt_at(self, stamps_ns: NDArray[np.int64]) -> Array:
         """Return the raw specific force, m/s^2, and the change of the rate, rad/s^2 (M, 6), in body axes, each by means over 0.2 s."""
         stamps = self._stamps
-        begin, end = (np.clip(stamps_ns + side, stamps[0], stamps[-1]) for side in (-_ABOUT_NS, _ABOUT_NS))
+        wide = np.flatnonzero(np.diff(stamps) > self._max_gap_ns)
+        starts, stops = stamps[np.append(0, wide + 1)], stamps[np.append(wide, len(stamps) - 1)]
+        near = np.searchsorted((stops[:-1] + starts[1:]) // 2, stamps_ns)  # samples without gaps
+        start, stop = starts[near], stops[near]
+        begin, end = (np.clip(stamps_ns + side, start, stop) for side in (-_ABOUT_NS, _ABOUT_NS))
         beyond = begin == end
-        # At the ends of the data half of that at least: of a few samples that vibrate, the change of the rate is off by rad/s^2.
+        # At the ends half of that at least: of a few samples that vibrate, the change of the rate is off by rad/s^2.
         begin, end = (
-            np.maximum(np.minimum(begin, end - _ABOUT_NS), stamps[0]),
-            np.minimum(np.maximum(end, begin + _ABOUT_NS), stamps[-1]),
+            np.maximum(np.minimum(begin, end - _ABOUT_NS), start),
+            np.minimum(np.maximum(end, begin + _ABOUT_NS), stop),
         )
         first = max(int(np.searchsorted(stamps, begin.min(), side="right")) - 1, 0)
         last = int(np.searchsorted(stamps, end.max(), side="left")) + 1

@@ -188,6 +188,22 @@ def test_what_is_felt_at_the_ends_of_the_data_is_a_mean_too(beyond_s: float) -> 
         assert np.abs(felt[:, 3:]).max() < 3.0
 
 
+@pytest.mark.parametrize("after_s", [-0.05, 0.03, 1.0, 2.0, 2.95, 3.05])
+def test_what_is_felt_about_a_gap_is_of_the_nearer_side(after_s: float) -> None:
+    """It was a line between two samples, which vibrate: of a velocity that is late, for all of the gap."""
+    run = simulate(replace(SCENARIO, duration_s=2.0), 1)
+    t, rng = np.append(np.arange(200), np.arange(500, 700)) * 0.01, np.random.default_rng(4)
+    accel = np.where(t < 3.0, -1.0, 1.0)[:, None] * [1.0, 0.0, 0.0] + rng.normal([0.0, 0.0, 9.8], 0.1, (400, 3))
+    accel[[199, 200]] += 5.0
+    stamps = np.round(t * 1e9).astype(np.int64)
+    imu = ImuSeries(
+        sensor="imu", stamps_ns=stamps, accel_mps2=accel, gyro_radps=np.zeros((400, 3)), seqs=np.arange(400)
+    )
+    links = INERTIAL.link(imu, run.config.sensors["imu"], np.eye(3), 9.8)
+    felt = links.felt_at(stamps[[199]] + round(after_s * 1e9))[0]
+    np.testing.assert_allclose(felt, [-1.0 if after_s < 1.5 else 1.0, 0.0, 9.8, 0.0, 0.0, 0.0], atol=0.6)
+
+
 @pytest.mark.parametrize("mode", ["offline", "online"])
 def test_it_is_estimated_and_the_heading_is_right(mode: str) -> None:
     def of(stamp_sigma_s: float) -> Solution:
