@@ -10,7 +10,17 @@ whose Euler term GTSAM's preintegration leaves out. Every other mount is taken f
 solution is moved to the body's origin at the end (`graphloc.solve`).
 """
 
-from graphloc.build._attach import Carry, Judged, Sited, attach, constant_keys, nav_state, solved_constants, state_of
+from graphloc.build._attach import (
+    Carry,
+    Judged,
+    Sited,
+    asks_for_delay,
+    attach,
+    constant_keys,
+    nav_state,
+    solved_constants,
+    state_of,
+)
 from graphloc.build._chains import (
     CONSTANT_TAILS,
     JUMP,
@@ -66,6 +76,7 @@ __all__ = [
     "StartPrior",
     "Stream",
     "Thinned",
+    "asks_for_delay",
     "at_level",
     "attach",
     "bias_step",

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.build._attach import Carry, state_of
+from graphloc.build._attach import Carry, asks_for_delay, state_of
 from graphloc.build._chains import without_drift
 from graphloc.build._problem import PositionJumps, Problem, Stream, inertial_factors, preintegrate
 from graphloc.build._usable import silent_sensors, sorted_out, usable_imu
@@ -117,6 +117,7 @@ def _streams(
         t, R = mount_of(name, config, mounts)
         slow, left_out, jumps = _slow_and_jumps(row, config, own, problem.datum, company, alone=alone)
         state, carry = _states_and_carries(own, problem.timeline, problem.links)
+        constants, stamps_ns = row.constants(config), stamps_of(own)
         found.append(
             Stream(
                 number=number,
@@ -126,13 +127,13 @@ def _streams(
                 slow=slow,
                 left_out=left_out,
                 position_jumps=jumps,
-                constants=row.constants(config),
+                constants=constants,
                 mount=gtsam.Pose3(gtsam.Rot3(R), t - problem.t_body_imu_m),
                 measurements=tuple(own),
                 state=state,
                 carry=carry,
-                gyro_radps=problem.links.gyro_at(stamps_of(own)),
-                felt=problem.links.felt_at(stamps_of(own)),
+                gyro_radps=problem.links.gyro_at(stamps_ns),
+                felt=problem.links.felt_at(stamps_ns) if asks_for_delay(constants) else np.zeros((len(own), 6)),
                 apart_s=apart_s_of(own),
             )
         )

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build._attach import Carry, nav_state
+from graphloc.build._attach import Carry, asks_for_delay, nav_state
 from graphloc.build._usual_motion import UsualMotion, usual_motion
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.frames import Array, Datum
@@ -41,7 +41,7 @@ class Stream:
         mount: pose of the sensor from the IMU, body axes.
         measurements: M of them by stamp. state: (M,) the state of each (`state_of`). carry: for each, the preintegrated motion
             from the state before it; None where its stamp is that of a state.
-        gyro_radps: (M, 3) raw rate at each measurement, body axes. felt: (M, 6) raw specific force and change of the rate about it.
+        gyro_radps: (M, 3) raw rate at each measurement, body axes. felt: (M, 6) raw specific force and change of the rate about it; 0 where no delay is asked for.
         apart_s: (M,) time since the measurement before; inf for the first.
         usual: at which slow nodes (N,) its error is at its usual level; None: not known (see `solve/_levels.py`).
     """
@@ -201,7 +201,9 @@ def _carried_anew(stream: Stream, timeline: Timeline, links: InertialLink, after
     for i, (m, carried) in enumerate(zip(stream.measurements, carry, strict=True)):
         if after_ns < m.stamp_ns <= until_ns:
             stamps_ns = np.array([m.stamp_ns])
-            gyro[i], felt[i] = links.gyro_at(stamps_ns)[0], links.felt_at(stamps_ns)[0]
+            gyro[i] = links.gyro_at(stamps_ns)[0]
+            if asks_for_delay(stream.constants):
+                felt[i] = links.felt_at(stamps_ns)[0]
             if carried is not None:
                 at_ns = int(timeline.stamps_ns[carried[0]])
                 carry[i] = carried[0], links.integrate(at_ns, m.stamp_ns, zero)

@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 import gtsam
 import numpy as np
 
-from graphloc.build import Carry, company_of, mount_of, slow_or_left_out, state_of, without_drift
+from graphloc.build import Carry, asks_for_delay, company_of, mount_of, slow_or_left_out, state_of, without_drift
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, InertialLink, Sensor, SlowProcess
@@ -249,7 +249,7 @@ class LiveProblem:
     def take(self, m: Measurement) -> tuple[LiveStream, int]:
         """Attach a measurement to its state; return its stream and its index there."""
         stream = self.streams[m.sensor]
-        carry, gyro_radps, felt = self._motion(m.stamp_ns)
+        carry, gyro_radps, felt = self._motion(stream, m.stamp_ns)
         timeline = self.timeline
         floor, nearest = timeline.floor(m.stamp_ns), timeline.nearest(m.stamp_ns)
         stream.measurements.append(m)
@@ -263,10 +263,10 @@ class LiveProblem:
     def reintegrate(self, stream: LiveStream, index: int) -> None:
         """Integrate again from the state before a measurement to its stamp: samples in between came late."""
         stream.carry[index], stream.gyro_radps[index], stream.felt[index] = self._motion(
-            stream.measurements[index].stamp_ns
+            stream, stream.measurements[index].stamp_ns
         )
 
-    def _motion(self, stamp_ns: int) -> tuple[Carry | None, Array, Array]:
+    def _motion(self, stream: LiveStream, stamp_ns: int) -> tuple[Carry | None, Array, Array]:
         """Return the motion from the state before a stamp to it (None at a state), the raw angular rate there (3,), rad/s, and what is felt (6,)."""
         floor = self.timeline.floor(stamp_ns)
         at_ns = self.timeline.stamps_ns[floor]
@@ -274,7 +274,8 @@ class LiveProblem:
         if stamp_ns > at_ns:
             carry = (floor, self.links.integrate(at_ns, stamp_ns, gtsam.imuBias.ConstantBias()))
         stamps_ns = np.array([stamp_ns])
-        return carry, self.links.gyro_at(stamps_ns)[0], self.links.felt_at(stamps_ns)[0]
+        felt = self.links.felt_at(stamps_ns)[0] if asks_for_delay(stream.constants) else np.zeros(6)
+        return carry, self.links.gyro_at(stamps_ns)[0], felt
 
 
 def live_problem(
