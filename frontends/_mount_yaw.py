@@ -95,7 +95,8 @@ class Felt:
         a = a - np.median(a.real) - 1j * np.median(a.imag)
         swing = integral(t, (gyro[:, 1] - 1j * gyro[:, 0]) * np.exp(1j * turned))
         # Tilted ahead, an accelerometer feels gravity astern. What lasts longer than waves the gyroscope does not know.
-        lately = max(1, round(_WAVES_S / max(float(np.median(np.diff(t))), 1e-3)))
+        step_s = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
+        lately = max(1, round(_WAVES_S / max(step_s, 1e-3)))
         tilt = swing - uniform_filter1d(swing, lately)
         moved = a * np.exp(1j * turned) + gravity_mps2 * tilt
         return cls(int(stamps_ns[0]), t, turned, integral(t, integral(t, moved)), swing)

@@ -13,6 +13,7 @@ from graphloc.eval.ekf import FilterResult
 from graphloc.eval.metrics import Antennas, Table
 from graphloc.eval.report import ReportData, Trust, durations_s, stretches, verdict
 from graphloc.eval.report._health import cure, section
+from graphloc.eval.report._track_verdict import _late_velocity
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frozen_receiver import WHY
 from graphloc.ledger import Ledger, LedgerRow, Outcome
@@ -76,6 +77,13 @@ def test_stamps_that_the_bounds_know_nothing_of_are_reported(
     (offline, _) = verdict(replace(data, solution=solution, calibration=Calibration(suggestions=(found,)))).tracks
     assert offline.trust is (Trust.WITH_CARE if said else Trust.YES)
     assert any(f"up to {4.0 * late_s:.2f} m behind or ahead" in r.text for r in offline.reasons) == said
+
+
+def test_a_track_of_one_state_is_turned_by_no_velocity(data: ReportData) -> None:
+    """It has no acceleration, and was a traceback instead of a report."""
+    track = data.solution.trajectory
+    one = replace(track.at(track.stamps_ns[:1]), cov=np.eye(6)[None])
+    assert not list(_late_velocity("velocity", 0.1, replace(data.solution, trajectory=one)))
 
 
 def antenna_at(data: ReportData, x_m: float, *, change_m: float = 0.0, sigma_m: float = 0.0) -> tuple[Trust, list[str]]:

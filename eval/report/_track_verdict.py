@@ -199,6 +199,8 @@ def _late_velocity(sensor: str, off_s: float, solution: Solution) -> Iterator[Re
     track = solution.trajectory
     assert track.cov is not None
     assert track.v_world_mps is not None
+    if len(track.stamps_ns) < 2:
+        return
     gained = np.gradient(track.v_world_mps[:, :2], track.stamps_ns * 1e-9, axis=0)
     power = (gained**2).sum(axis=1)
     turned_deg = abs(float(np.degrees(off_s * (power @ solution.gyro_radps[:, 2]) / max(power.sum(), 1e-9))))
