@@ -5,17 +5,30 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphloc.graph import PLACE, TIME_OFFSET, Constant
+from graphloc.config import GnssConfig, VelocityConfig
+from graphloc.frames import Array
+from graphloc.graph import PLACE, TIME_OFFSET, Attachment, Constant
+
+_NOT_OFF = np.zeros(3)
 
 
-def stamps_and_antenna(stamp_sigma_s: float, mount_sigma_m: float) -> tuple[Constant, ...]:
-    """Return how much later than stamped a receiver measures, s, and how far off its antenna is (3,), m, each where its sigma is not 0."""
+def stamps_and_antenna(config: GnssConfig | VelocityConfig) -> tuple[Constant, ...]:
+    """Return how much later than stamped a receiver measures, s, and how far off its antenna is (3,), m, as far as that is not known."""
     unknown: dict[str, float] = {}
-    if stamp_sigma_s > 0.0:
-        unknown[TIME_OFFSET] = stamp_sigma_s
-    if mount_sigma_m > 0.0:
-        unknown |= dict.fromkeys(PLACE, mount_sigma_m)
+    if config.stamp_sigma_s > 0.0:
+        unknown[TIME_OFFSET] = config.stamp_sigma_s
+    if config.mount_sigma_m > 0.0:
+        unknown |= dict.fromkeys(PLACE, config.mount_sigma_m)
     if not unknown:
         return ()
     # One of all: a linear factor has three states at most.
     return (Constant(name="stamps and antenna", sigma=np.array([*unknown.values()]), corrects=tuple(unknown)),)
+
+
+def late_and_off(at: Attachment, config: GnssConfig | VelocityConfig) -> tuple[float, Array]:
+    """Return the estimates of both, s and m, the latter in the antenna's axes; zero where they are not estimated."""
+    if not at.constants:  # of a sensor with none, or taken as configured to examine that
+        return 0.0, _NOT_OFF
+    value = at.constants[0][1]
+    late = float(value[0]) if config.stamp_sigma_s > 0.0 else 0.0
+    return late, value[-3:] if config.mount_sigma_m > 0.0 else _NOT_OFF

@@ -25,7 +25,7 @@ import numpy as np
 
 from graphloc.config import GnssConfig
 from graphloc.factors._noise import noise_model, with_floors
-from graphloc.factors._receiver import stamps_and_antenna
+from graphloc.factors._receiver import late_and_off, stamps_and_antenna
 from graphloc.frames import Array, Datum, Geodetic, skew
 from graphloc.graph import (
     Attachment,
@@ -40,7 +40,6 @@ from graphloc.graph import (
 from graphloc.measurements import GnssPosition, world_from_fixes
 
 _TIE_M = 0.005  # how exactly leaf and lever arm follow the pose; far below any GNSS noise
-_NOT_OFF = np.zeros(3)
 _TIE = gtsam.noiseModel.Isotropic.Sigma(3, _TIE_M)
 
 
@@ -71,18 +70,9 @@ def _fix_world_m(m: GnssPosition, at: Attachment) -> Array:
     return _world_m(m, at.datum)
 
 
-def _late_and_off(at: Attachment, config: GnssConfig) -> tuple[float, Array]:
-    """Return tau, s, and o (3,), m, in the antenna's axes; zero where they are not estimated."""
-    if not at.constants:  # of a sensor with none, or taken as configured to examine that
-        return 0.0, _NOT_OFF
-    value = at.constants[0][1]
-    late = float(value[0]) if config.stamp_sigma_s > 0.0 else 0.0
-    return late, value[-3:] if config.mount_sigma_m > 0.0 else _NOT_OFF
-
-
 def _predicted_m(at: Attachment, config: GnssConfig) -> Array:
     """The fix (3,) without white noise, in world."""
-    late, off = _late_and_off(at, config)
+    late, off = late_and_off(at, config)
     place = at.T_world_body.transformFrom(at.T_state_sensor.transformFrom(off))
     if at.slow_value is not None:
         place = place - at.slow_value
@@ -93,7 +83,7 @@ def _predicted_m(at: Attachment, config: GnssConfig) -> Array:
 
 def _by_constants(at: Attachment, config: GnssConfig) -> tuple[Array, ...]:
     """Return the derivative (3, k) of the fix by tau and o, as far as they are estimated."""
-    late, off = _late_and_off(at, config)
+    late, off = late_and_off(at, config)
     columns = [at.sensor_velocity_mps(off)[:, None]] if config.stamp_sigma_s > 0.0 else []
     if config.mount_sigma_m > 0.0:
         turn = at.T_state_sensor.rotation().matrix()
@@ -162,7 +152,7 @@ def slow(config: GnssConfig) -> SlowProcess | None:
 
 def constants(config: GnssConfig) -> tuple[Constant, ...]:
     """Return how much later than stamped fixes were measured, s, and how far off the antenna is, m, as far as that is not known."""
-    return stamps_and_antenna(config.stamp_sigma_s, config.mount_sigma_m)
+    return stamps_and_antenna(config)
 
 
 def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:
@@ -175,7 +165,7 @@ def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:
 
 def _antenna_jacobian(at: Attachment, config: GnssConfig) -> Array:
     """d(p + R (l + o) + u tau) / d(body tangent), (3, 6)."""
-    R, (late, off) = at.T_world_body.rotation().matrix(), _late_and_off(at, config)
+    R, (late, off) = at.T_world_body.rotation().matrix(), late_and_off(at, config)
     return np.hstack([-R @ skew(at.T_state_sensor.transformFrom(off) + late * at.swing_mps(off)), R])
 
 

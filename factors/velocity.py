@@ -19,31 +19,22 @@ import numpy as np
 
 from graphloc.config import VelocityConfig
 from graphloc.factors._noise import with_floors
-from graphloc.factors._receiver import stamps_and_antenna
+from graphloc.factors._receiver import late_and_off, stamps_and_antenna
 from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Constant, Hint, Residual, Sensor
 from graphloc.measurements import GnssVelocity
 
 
-def _late_and_off(at: Attachment, config: VelocityConfig) -> tuple[float, Array | None]:
-    """Return tau, s, and o (3,), m, in the antenna's axes; 0 and None where they are not estimated."""
-    if not at.constants:  # of a sensor with none, or taken as configured to examine that
-        return 0.0, None
-    value = at.constants[0][1]
-    late = float(value[0]) if config.stamp_sigma_s > 0.0 else 0.0
-    return late, value[-3:] if config.mount_sigma_m > 0.0 else None
-
-
 def _predicted_mps(at: Attachment, config: VelocityConfig) -> Array:
     """The velocity (3,) without noise, in world."""
-    late, off = _late_and_off(at, config)
+    late, off = late_and_off(at, config)
     v = at.sensor_velocity_mps(off)
     return v + at.sensor_acceleration_mps2(off) * late if late else v
 
 
 def _attitude_jacobian(at: Attachment, config: VelocityConfig) -> Array:
     """Return the derivative (3, 6) of what R turns by the body tangent (theta, rho)."""
-    late, off = _late_and_off(at, config)
+    late, off = late_and_off(at, config)
     turned = at.swing_mps(off) + (at.pushed_mps2(off) * late if late else 0.0)
     return np.hstack([-at.T_world_body.rotation().matrix() @ skew(turned), np.zeros((3, 3))])
 
@@ -52,7 +43,7 @@ def _by_constants(at: Attachment, config: VelocityConfig) -> tuple[Array, ...]:
     """Return the derivative (3, k) of the velocity by tau and o, as far as they are estimated."""
     if not at.constants:
         return ()
-    late, off = _late_and_off(at, config)
+    late, off = late_and_off(at, config)
     columns = [at.sensor_acceleration_mps2(off)[:, None]] if config.stamp_sigma_s > 0.0 else []
     if config.mount_sigma_m > 0.0:
         swing = skew(at.gyro_radps)
@@ -81,7 +72,7 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
 
 def constants(config: VelocityConfig) -> tuple[Constant, ...]:
     """Return how much later than stamped velocities were measured, s, and how far off the antenna is, m, as far as that is not known."""
-    return stamps_and_antenna(config.stamp_sigma_s, config.mount_sigma_m)
+    return stamps_and_antenna(config)
 
 
 def ideal(at: Attachment, config: VelocityConfig) -> GnssVelocity:
