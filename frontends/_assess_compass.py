@@ -26,6 +26,7 @@ _STRAIGHT_DEG = 20.0  # courses that turn by less tell no convention
 _ASKEW_DEG = 15.0  # antennas are mounted along a vessel or athwart, to this
 _BLOCK_S = 30
 _SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
+_SIDEWAYS_DEG = 45.0  # to which scatter courses still tell by which quarter turn two antennas are mounted
 _RELATIVE_DEG = 30.0  # off the course, from which an IMU's orientation has a north of its own
 
 
@@ -66,22 +67,24 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
         (stamps_ns - origin) / NS_PER_S, angle, (courses.stamps_ns - origin) / NS_PER_S, courses, told or by_gyro, usual
     )
     # Courses tell headings of a vessel that goes ahead; of one that is set sideways only the gyroscope tells whether it is one. But
-    # an IMU's own orientation follows the gyroscope wherever north is.
+    # an IMU's own orientation follows the gyroscope wherever north is. Two antennas know north; athwart, they are a quarter turn off.
+    askew_deg = abs((fit.offset_deg + 45.0) % 90.0 - 45.0)
+    quarter = gnss and fit.scatter_deg < _SIDEWAYS_DEG and askew_deg < _ASKEW_DEG
     fits_course = bool(fit.scatter_deg < _SCATTERS_DEG)
     sideways = (
         not fits_course
         and by_gyro is not None
-        and (stream.msgtype != IMU or abs(fit.offset_deg) < _RELATIVE_DEG)
+        and (stream.msgtype != IMU or abs(fit.offset_deg) < _RELATIVE_DEG or quarter)
         and follows_turning(turning, stamps_ns, _in_enu(angle, fit.convention))
     )
     return CompassReport(
         **plain,
         usable=fits_course or sideways,
         convention=fit.convention,
-        offset_deg=None if sideways else fit.offset_deg,
+        offset_deg=None if sideways and not quarter else fit.offset_deg,
         scatter_deg=fit.scatter_deg,
         leeway_deg=None
-        if sideways
+        if sideways and not quarter
         else _wanders_deg(courses.stamps_ns, _ahead(fit.apart_rad, np.radians(fit.offset_deg))),
         samples=len(fit.apart_rad),
         why=_why(fit, by_gyro, told=told is not None, fits_course=fits_course, sideways=sideways),

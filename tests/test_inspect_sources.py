@@ -725,6 +725,37 @@ def test_a_compass_of_a_vessel_that_goes_sideways_is_one_if_it_turns_as_the_gyro
         assert compass.mount_offset_sigma_deg == pytest.approx(10.0)
 
 
+def test_two_antennas_athwart_that_are_silent_in_turns_are_a_compass_beside_a_course_that_wanders(
+    tmp_path: Path,
+) -> None:
+    """An Imu of an orientation alone, at 1 Hz, a quarter turn off, of a vessel that is set sideways: taken for a relative heading."""
+    make, crab_rad, per_s = Messages(2), np.radians(22.0), 2.0 * np.pi / 50.0
+    items: list[Item] = []
+    for topic, at, m in drive(make, seconds=200):
+        t = (at - START_NS) / S
+        if topic == "/compass" and (at - START_NS) % S == 0 and not 60.0 < t < 110.0:
+            own = 2.0 * np.arctan2(m.quaternion.z, m.quaternion.w) - crab_rad * np.sin(per_s * t)
+            athwart = np.pi / 2.0 - own - np.pi / 2.0  # east, north, up; the drive's own is clockwise from north
+            heading = make.imu(at, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            heading.orientation.x, heading.orientation.y = 0.0, 0.0
+            heading.orientation.z, heading.orientation.w = np.sin(athwart / 2.0), np.cos(athwart / 2.0)
+            heading.orientation_covariance[:] = 0.0
+            items.append(("/rover/navheading", at, heading))
+        elif topic == "/imu":
+            a, w = m.linear_acceleration, m.angular_velocity
+            rate = crab_rad * per_s * np.cos(per_s * t)
+            items.append((topic, at, make.imu(at, (a.x, a.y, a.z), (w.x, w.y, w.z + rate))))
+        elif topic != "/compass":
+            items.append((topic, at, m))
+    _, config, text = look(tmp_path, items, make)
+    (compass,) = config.of_kind("compass").values()
+    assert isinstance(compass, CompassConfig)
+    assert compass.enabled
+    assert compass.convention == "enu"
+    assert compass.mount.rpy_deg[2] == pytest.approx(-90.0)
+    assert "often goes sideways, since it turns as the gyro does" in text
+
+
 def stamped_late(make: Messages, late_s: float, *, seconds: int, noise_m: float) -> list[Item]:
     """A drive without wheels, whose fixes are stamped so much later than they were measured."""
     items = [
