@@ -23,7 +23,7 @@ from graphloc.online._heading_check import Fit, HeadingCheck
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.recording import Recording, quiet
 from graphloc.replay import arrivals
-from graphloc.solution import Cause, Solution
+from graphloc.solution import Cause, Health, Solution
 from graphloc.solve import _start
 from graphloc.solve._align import align, wanted_travel_m
 from graphloc.solve._start import solve_start
@@ -210,18 +210,21 @@ def test_online_a_guess_ends_once_the_motion_tells_the_heading() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sigma_m", "slow", "travel_m"),
+    ("sigma_m", "slow", "travel_m", "least_m"),
     [
-        (0.02, {"horizontal_sigma_m": 0.03}, 1.0),
-        (0.1, {"horizontal_sigma_m": 0.2}, 20.0 * np.hypot(0.1, 0.2 * np.sqrt(2.0 * (1.0 - np.exp(-0.15))))),
-        (1.0, {}, 15.0),
-        (4.0, {"enabled": False}, 20.0),
+        (0.02, {"horizontal_sigma_m": 0.03}, 1.0, 1.0),
+        (0.1, {"horizontal_sigma_m": 0.2}, 20.0 * np.hypot(0.1, 0.2 * np.sqrt(2.0 * (1.0 - np.exp(-0.15)))), 1.0),
+        (1.0, {}, 15.0, 5.0 * np.hypot(1.0, 2.0 * np.sqrt(2.0 * (1.0 - np.exp(-0.15))))),
+        (4.0, {"enabled": False}, 20.0, 20.0),
     ],
 )
-def test_travel_that_may_tell_a_heading(sigma_m: float, slow: dict[str, Any], travel_m: float) -> None:
-    """Twenty times what places are off by, or drift by within half a minute, 15 m at most, or five times: RTK needs a metre."""
+def test_travel_that_may_tell_a_heading(sigma_m: float, slow: dict[str, Any], travel_m: float, least_m: float) -> None:
+    """Twenty times what places are off by, or drift by within half a minute, 15 m at most, or five times: RTK needs a metre.
+
+    Five times is the least, where a craft goes no farther.
+    """
     process = factors_gnss.slow(GnssConfig.model_validate({"topic": "/fix", "slow_error": slow}))
-    assert wanted_travel_m([(np.full((9, 2), sigma_m), process)]) == pytest.approx(travel_m)
+    assert wanted_travel_m([(np.full((9, 2), sigma_m), process)]) == pytest.approx((travel_m, least_m))
 
 
 def test_online_a_robot_at_rest_waits_for_travel() -> None:
@@ -245,6 +248,26 @@ def test_online_a_robot_in_a_yard_starts(monkeypatch: pytest.MonkeyPatch) -> Non
     assert (solved.trajectory.stamps_ns[0] - recording.imu.stamps_ns[0]) * 1e-9 < 12.0
     assert (np.abs(error) < 2.5 * sigma).all()
     assert sigma[-1] < 12.0
+
+
+@pytest.mark.parametrize(("speed_mps", "starts"), [(1.0, True), (0.0, False)])
+def test_online_a_boat_that_circles_within_the_usual_travel_starts(
+    speed_mps: float, starts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A square of 6 m by fixes good to 0.6 m: 15 m of travel never came, nor did a place. Its heading is a guess. At rest it waits."""
+    monkeypatch.setattr(sys.modules[__name__], "FIX_M", 0.6)
+    monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 5.5)
+    monkeypatch.setattr(online_start, "_LONGEST_WAIT_S", 24.0)
+    recording, config, t, yaw = robot(1, 34.0, *np.arange(4.0, 30.0, 7.0), speed_mps=speed_mps)
+    online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL)
+    estimates = [e for m in arrivals(recording) if (e := online.feed(m)) is not None]
+    assert bool(estimates) is starts
+    assert recording.imu is not None
+    for e in estimates:
+        off = wrap_angle(e.yaw_rad - np.interp((e.stamp_ns - recording.imu.stamps_ns[0]) * 1e-9, t, yaw))
+        assert off**2 < 4.0 * e.cov[5, 5]
+        assert e.health is not Health.GOOD
+        assert e.reason.cause is Cause.GUESSED_HEADING
 
 
 @pytest.mark.usefixtures("short_wait")

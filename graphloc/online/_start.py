@@ -99,23 +99,28 @@ def try_start(setup: Setup, imu: ImuSeries, measurements: Sequence[Measurement],
         datum = datum or origin.choose_datum(recording, config, setup.rows)
     except GraphlocError as error:
         return str(error)
-    if missing := _missing(setup, recording, datum):
+    missing, told = _missing(setup, recording, datum, patient=span_s >= _LONGEST_WAIT_S)
+    if missing:
         return missing
     try:
-        return _solved(setup, recording, datum)
+        return _solved(setup, recording, datum, told=told)
     except SolveError as error:
         return f"data from which the start can be solved: {error}"
 
 
-def _missing(setup: Setup, recording: Recording, datum: Datum) -> str:
-    """Return what position or heading still needs; empty where both are observable."""
+def _missing(setup: Setup, recording: Recording, datum: Datum, *, patient: bool) -> tuple[str, bool]:
+    """Return what position or heading still needs, empty where both are observable, and whether the heading may be taken as told.
+
+    Args:
+        patient: travel was waited for long enough: a craft that circles within less gets a place, and its heading is a guess.
+    """
     hints = [setup.hint(m, datum) for m in recording.measurements]
     placed = [k for k, h in enumerate(hints) if np.isfinite(h.p_world_m[:2]).all()]
     places = [hints[k] for k in placed]
     if not places:
-        return "a position: a fix, a match, a tag or a pose"
+        return "a position: a fix, a match, a tag or a pose", False
     if setup.config.start.heading_deg is not None or any(np.isfinite(h.yaw_rad) for h in hints):
-        return ""
+        return "", True
     p = np.array([h.p_world_m[:2] for h in places])
     names = [recording.measurements[k].sensor for k in placed]
     kinds = {row.kind: row for row in setup.rows}
@@ -124,14 +129,15 @@ def _missing(setup: Setup, recording: Recording, datum: Datum) -> str:
         config = setup.config.sensors[name]
         sigma_m = np.array([h.p_sigma_m[:2] for h, of in zip(places, names, strict=True) if of == name])
         noises.append((sigma_m, kinds[config.kind].slow(config)))
-    wanted_m = wanted_travel_m(noises)
-    if np.hypot(*(p - np.median(p[:5], axis=0)).T).max() > wanted_m:
-        return ""
-    return f"a heading: from a sensor, from `start.heading_deg`, or from {wanted_m:.0f} m of travel"
+    usual_m, least_m = wanted_travel_m(noises)
+    travelled_m = float(np.hypot(*(p - np.median(p[:5], axis=0)).T).max())
+    if travelled_m > (least_m if patient else usual_m):
+        return "", travelled_m > usual_m
+    return f"a heading: from a sensor, from `start.heading_deg`, or from {usual_m:.0f} m of travel", False
 
 
-def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
-    """Return the start as the batch solver solves it, or what it waits for."""
+def _solved(setup: Setup, recording: Recording, datum: Datum, *, told: bool) -> Started | str:
+    """Return the start as the batch solver solves it, or what it waits for; `told`: whether the motion may tell its heading."""
     config, rows = setup.config, setup.rows
     whole = origin.with_synthetic(recording, config, datum, rows)
     problem = make_problem(whole, config, datum, rows, setup.inertial, company_of(config, rows))
@@ -141,7 +147,7 @@ def _solved(setup: Setup, recording: Recording, datum: Datum) -> Started | str:
         return "data in which the IMU and the other sensors agree"
     if span_s < _CHOICE_WAIT_S and (undecided := _undecided(problem, result)):
         return undecided
-    heading = _heading(setup, recording, datum, result)
+    heading = _heading(setup, recording, datum, result, told=told)
     if isinstance(heading, str):
         return heading
     heights = {
@@ -195,7 +201,9 @@ def _undecided(problem: Problem, result: BatchResult) -> str:
     return ""
 
 
-def _heading(setup: Setup, recording: Recording, datum: Datum, result: BatchResult) -> UnmeasuredHeading | str | None:
+def _heading(
+    setup: Setup, recording: Recording, datum: Datum, result: BatchResult, *, told: bool
+) -> UnmeasuredHeading | str | None:
     """Return how far the heading may be off; None where sensors or the motion tell it, a text where the start waits for it."""
     problem = result.problem
     last = keys.pose(len(problem.timeline) - 1)
@@ -206,7 +214,7 @@ def _heading(setup: Setup, recording: Recording, datum: Datum, result: BatchResu
     if setup.config.start.heading_deg is not None and not _measured(setup, recording, datum):
         why = "the heading is a guess: only `start.heading_deg` told it, and the gyroscope has carried it since"
         return UnmeasuredHeading(why=why, since_ns=last_ns, sigma_rad=sigma, drift_radps=drift_radps)
-    if not (result.headings > 1 or sigma > DOUBTFUL_RAD):
+    if told and not (result.headings > 1 or sigma > DOUBTFUL_RAD):
         return None
     found = f"the motion so far tells it to {np.degrees(sigma):.0f} deg (1 sigma)"
     if result.headings > 1:

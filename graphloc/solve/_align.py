@@ -28,7 +28,7 @@ _USUAL_SPEED_MPS = 10.0  # 1 sigma, where the speed is unknown
 _CARRIED_RAD = np.radians(20.0)  # error by gyro bias, 1 sigma: from later on, a heading is no longer one of the start
 _OWN_TILT_RAD = 0.5  # 1 sigma of roll and pitch, without accelerometer data
 # Travel from which the motion may tell the heading: so many times what places are off by, or drift by within so long. Few are enough
-# beyond the usual travel; below the least, an antenna sways.
+# beyond the usual travel, and where there never is more; below the least, an antenna sways.
 _MANY, _FEW, _DRIFT_S, _LEAST_M, _USUAL_M = 20.0, 5.0, 30.0, 1.0, 15.0
 
 
@@ -83,7 +83,7 @@ def align(problem: Problem) -> Start:
     early = {name: rows for name, rows in yaws.items() if rows[0, 0] * bias_sigma[2] < _CARRIED_RAD}
     noises = [(np.array([h.p_sigma_m[:2] for _, h in hints[stream.name]]), stream.row.slow(stream.config))
               for stream in problem.streams if hints[stream.name]]  # fmt: skip
-    moved_s = _moved_at(track, wanted_travel_m(noises))
+    moved_s = next((t for m in wanted_travel_m(noises) if (t := _moved_at(track, m)) is not None), None)
     if early or (moved_s is not None and moved_s < min((rows[0, 0] for rows in yaws.values()), default=np.inf)):
         yaws = early
     turn = _turns(problem, max([window, *(rows[0, 0] for rows in yaws.values())]) + 10.0 if yaws else 180.0, bias)
@@ -225,11 +225,12 @@ def _headings(
     )
 
 
-def wanted_travel_m(noises: Sequence[tuple[Array, SlowProcess | None]]) -> float:
-    """Return the travel, m, from which the motion may tell a heading that no sensor measures.
+def wanted_travel_m(noises: Sequence[tuple[Array, SlowProcess | None]]) -> tuple[float, float]:
+    """Return the travel, m, from which the motion may tell a heading that no sensor measures, and that of a craft which goes no farther.
 
     By a twentieth of it the places are off, or drift meanwhile: a course by two of them is good to 4 deg. 15 m are enough as long as
-    that is no more than a fifth. How well a motion tells it is seen once it is solved.
+    that is no more than a fifth, and a fifth is all that one needs which circles in less. How well a motion tells it is seen once it
+    is solved.
 
     Args:
         noises: of each sensor, sigma (N, 2) of its places, m, NaN where it tells none; and its slow error.
@@ -241,7 +242,8 @@ def wanted_travel_m(noises: Sequence[tuple[Array, SlowProcess | None]]) -> float
             drift = float(np.sqrt(2.0 * slow.sigma**2 * (1.0 - slow.after(_DRIFT_S)[0]))[level].max())
         off.append(np.hypot(sigma_m, drift))
     off_m = float(np.nanmedian(np.concatenate(off)))
-    return float(max(_FEW * off_m, np.clip(_MANY * off_m, _LEAST_M, _USUAL_M)))
+    few_m = max(_FEW * off_m, _LEAST_M)
+    return float(max(few_m, min(_MANY * off_m, _USUAL_M))), float(few_m)
 
 
 def _moved_at(track: Track, wanted_m: float) -> float | None:
