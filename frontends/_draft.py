@@ -38,7 +38,6 @@ _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
 _WANDER_DEG, _LARGER = 0.7, 1.4
 _TURNED_DEG = 10.0  # off the course, from which a compass is taken for turned in the craft
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
-_ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset as well
 _LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images as they come
 _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
@@ -523,7 +522,7 @@ def _mount_lines(compass: CompassReport) -> list[str]:
         askew = round(compass.offset_deg), max(_LEEWAY_DEG, compass.scatter_deg or 0.0)
         yaw, sigma = (quarter, rest) if rest < 15.0 else askew
         why = "a course is no heading, and tells no more"
-        astern = ", unless the vessel goes astern most of the time: then 0" if abs(yaw) > _ASTERN_DEG else ""
+        astern = ", unless the vessel goes astern most of the time: then 0" if compass.backwards else ""
         lines.append(
             f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course{astern}"
         )

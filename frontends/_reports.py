@@ -18,6 +18,7 @@ Vec = tuple[float, float, float]
 # HDT and THS of a GNSS receiver; topics of ublox_gps, septentrio_gnss_driver, mavros and their like.
 _TWO_ANTENNAS = re.compile(r"[ +]G[A-Z](HDT|THS)$|gps|gnss|nav_?heading|rel_?pos|dual|moving_?bas", re.IGNORECASE)
 _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
+_ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset of its compass as well
 _DIFFERS = 1.5  # times the default of a slow error
 # Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
 _RTK_M = (0.05, 0.1)
@@ -213,6 +214,11 @@ class CompassReport:
     wander_deg: float | None = None
     two_antennas: bool = False
     late_s: tuple[float, float] | None = None
+
+    @property
+    def backwards(self) -> bool:
+        """Whether it is half a turn off the course, as one that is mounted backwards, or of a vessel that goes astern."""
+        return self.usable and self.offset_deg is not None and abs(self.offset_deg) > _ASTERN_DEG
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

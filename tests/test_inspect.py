@@ -316,6 +316,7 @@ def test_imu_orientation_as_compass(
         assert compass.mount.rpy_deg == pytest.approx((0.0, 0.0, mount_deg), abs=1.0)
         assert compass.mount_offset_sigma_deg == pytest.approx(sigma_deg, abs=1.0)
         assert ("unless the vessel goes astern" in text) is (mount_deg == 180.0)
+        assert ("drafted as mounted backwards" in render(found)) is (mount_deg == 180.0)
     else:
         assert "compass" not in config.sensors
         assert "orientation of /ahrs: left out as a compass" in text
