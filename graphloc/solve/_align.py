@@ -83,7 +83,10 @@ def align(problem: Problem) -> Start:
     early = {name: rows for name, rows in yaws.items() if rows[0, 0] * bias_sigma[2] < _CARRIED_RAD}
     noises = [(np.array([h.p_sigma_m[:2] for _, h in hints[stream.name]]), stream.row.slow(stream.config))
               for stream in problem.streams if hints[stream.name]]  # fmt: skip
-    moved_s = next((t for m in wanted_travel_m(noises) if (t := _moved_at(track, m)) is not None), None)
+    usual_m, least_m = wanted_travel_m(noises)
+    moved_s = _moved_at(track, usual_m)
+    if moved_s is None and not yaws:
+        moved_s = _moved_at(track, least_m)
     if early or (moved_s is not None and moved_s < min((rows[0, 0] for rows in yaws.values()), default=np.inf)):
         yaws = early
     turn = _turns(problem, max([window, *(rows[0, 0] for rows in yaws.values())]) + 10.0 if yaws else 180.0, bias)
