@@ -67,9 +67,9 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
         (stamps_ns - origin) / NS_PER_S, angle, (courses.stamps_ns - origin) / NS_PER_S, courses, told or by_gyro, usual
     )
     # Courses tell headings of a vessel that goes ahead; of one that is set sideways only the gyroscope tells whether it is one. But
-    # an IMU's own orientation follows the gyroscope wherever north is. Two antennas know north; athwart, they are a quarter turn off.
-    askew_deg = abs((fit.offset_deg + 45.0) % 90.0 - 45.0)
-    quarter = gnss and fit.scatter_deg < _SIDEWAYS_DEG and askew_deg < _ASKEW_DEG
+    # an IMU's own orientation follows the gyroscope wherever north is. Two antennas know north, and an Imu of an orientation alone is
+    # taken for such; athwart, they are a quarter turn off.
+    quarter = gnss and fit.scatter_deg < _SIDEWAYS_DEG and abs(abs(fit.offset_deg) - 90.0) < _ASKEW_DEG
     fits_course = bool(fit.scatter_deg < _SCATTERS_DEG)
     sideways = (
         not fits_course

@@ -24,10 +24,10 @@ def render(inspection: Inspection) -> str:
     for compass in inspection.compasses:
         verdict = f"fits as a compass ({compass.convention})" if compass.usable else "not usable as a compass"
         lines += ["", f"{compass.topic}: {verdict}", f"  {compass.why}"]
-        if compass.backwards:
+        if compass.backwards and not compass.like:
             lines.append(
-                "  half a turn off the course: drafted as mounted backwards. If the vessel went astern most of the time, every heading is "
-                "half a turn off then: set its mount's yaw to 0, and turn that of the IMU by 180 where it is by the motion"
+                "  half a turn off the course: drafted as mounted backwards. If the vessel went astern most of the time, that turns every "
+                "heading by half a turn: set its mount's yaw to 0, and turn that of the IMU by 180 where it is by the motion"
             )
         if compass.late_s:
             lines.append("  its turns fit the gyro's {:+.2f} +- {:.2f} s from its stamps".format(*compass.late_s))

@@ -192,6 +192,7 @@ class CompassReport:
         usable: whether it fits the course; convention: the better one.
         offset_deg: mean of yaw minus course; scatter_deg: its circular standard deviation.
         leeway_deg: how far that wanders, from half minute to half minute: leeway, or the compass; None where it is not told.
+            Of a vessel that is set sideways, both are None, but of two antennas athwart.
         samples: courses compared; why: the judgement in words. unit: of bare numbers, else None.
         like: an orientation that says the same, of the same device, else ''.
         wander_deg: how far its error wanders beside the gyroscope, 1 sigma for a minute; None where that does not tell.

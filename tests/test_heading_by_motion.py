@@ -24,7 +24,7 @@ from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.recording import Recording, quiet
 from graphloc.replay import arrivals
 from graphloc.solution import Cause, Health, Solution
-from graphloc.solve import _start
+from graphloc.solve import _align, _start
 from graphloc.solve._align import align, wanted_travel_m
 from graphloc.solve._start import solve_start
 from tests.slowly import with_few_states
@@ -248,6 +248,22 @@ def test_online_a_robot_in_a_yard_starts(monkeypatch: pytest.MonkeyPatch) -> Non
     assert (solved.trajectory.stamps_ns[0] - recording.imu.stamps_ns[0]) * 1e-9 < 12.0
     assert (np.abs(error) < 2.5 * sigma).all()
     assert sigma[-1] < 12.0
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "stated_deg", "slower", "by_motion"),
+    [(1.0, None, 1.0, True), (1.0, 30.0, 1.0, False), (0.0, None, 1.0, False), (1.0, None, 60.0, False)],
+)
+def test_the_least_travel_counts_where_nothing_else_tells_the_heading_and_early(
+    speed_mps: float, stated_deg: float | None, slower: float, by_motion: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A square of 6 m, by fixes good to 0.6 m. What takes minutes may be drift."""
+    monkeypatch.setattr(sys.modules[__name__], "FIX_M", 0.6)
+    recording, config, _, _ = robot(1, 34.0, *np.arange(4.0, 30.0, 7.0), speed_mps=speed_mps)
+    monkeypatch.setattr(_align, "_LATEST_S", 120.0 / slower)
+    config = config.model_copy(update={"start": config.start.model_copy(update={"heading_deg": stated_deg})})
+    datum = app.choose_datum(recording, config)
+    assert align(make_problem(recording, config, datum, SENSORS, INERTIAL)).by_motion is by_motion
 
 
 @pytest.mark.parametrize(("speed_mps", "starts"), [(1.0, True), (0.0, False)])

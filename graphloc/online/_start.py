@@ -133,7 +133,8 @@ def _missing(setup: Setup, recording: Recording, datum: Datum, *, patient: bool)
     travelled_m = float(np.hypot(*(p - np.median(p[:5], axis=0)).T).max())
     if travelled_m > (least_m if patient else usual_m):
         return "", travelled_m > usual_m
-    return f"a heading: from a sensor, from `start.heading_deg`, or from {usual_m:.0f} m of travel", False
+    wanted_m = least_m if patient else usual_m
+    return f"a heading: from a sensor, from `start.heading_deg`, or from {wanted_m:.0f} m of travel", False
 
 
 def _solved(setup: Setup, recording: Recording, datum: Datum, *, told: bool) -> Started | str:
@@ -217,9 +218,11 @@ def _heading(
     if told and not (result.headings > 1 or sigma > DOUBTFUL_RAD):
         return None
     found = f"the motion so far tells it to {np.degrees(sigma):.0f} deg (1 sigma)"
-    if result.headings > 1:
+    if not told:
+        found = "it has not gone far enough for its motion to tell it"
+    elif result.headings > 1:
         found += f", {result.headings} candidates explain it"
-    if _span_s(result) < _LONGEST_WAIT_S:
+    if told and _span_s(result) < _LONGEST_WAIT_S:
         return f"a heading: {found}; turn, add a heading sensor or set `start.heading_deg`"
     why = f"the heading is a guess: {found}"
     return UnmeasuredHeading(why=why, since_ns=last_ns, sigma_rad=ANY_HEADING_RAD, drift_radps=drift_radps)

@@ -28,8 +28,9 @@ _USUAL_SPEED_MPS = 10.0  # 1 sigma, where the speed is unknown
 _CARRIED_RAD = np.radians(20.0)  # error by gyro bias, 1 sigma: from later on, a heading is no longer one of the start
 _OWN_TILT_RAD = 0.5  # 1 sigma of roll and pitch, without accelerometer data
 # Travel from which the motion may tell the heading: so many times what places are off by, or drift by within so long. Few are enough
-# beyond the usual travel, and where there never is more; below the least, an antenna sways.
-_MANY, _FEW, _DRIFT_S, _LEAST_M, _USUAL_M = 20.0, 5.0, 30.0, 1.0, 15.0
+# beyond the usual travel, and where there never is more and nothing else tells it; below the least, an antenna sways, and later than
+# the latest, fixes have drifted as far.
+_MANY, _FEW, _DRIFT_S, _LEAST_M, _USUAL_M, _LATEST_S = 20.0, 5.0, 30.0, 1.0, 15.0, 120.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,8 +86,9 @@ def align(problem: Problem) -> Start:
               for stream in problem.streams if hints[stream.name]]  # fmt: skip
     usual_m, least_m = wanted_travel_m(noises)
     moved_s = _moved_at(track, usual_m)
-    if moved_s is None and not yaws:
-        moved_s = _moved_at(track, least_m)
+    if moved_s is None and not yaws and problem.config.start.heading_deg is None:
+        soon_s = _moved_at(track, least_m)
+        moved_s = soon_s if soon_s is not None and soon_s <= _LATEST_S else None
     if early or (moved_s is not None and moved_s < min((rows[0, 0] for rows in yaws.values()), default=np.inf)):
         yaws = early
     turn = _turns(problem, max([window, *(rows[0, 0] for rows in yaws.values())]) + 10.0 if yaws else 180.0, bias)
