@@ -77,14 +77,15 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
         and (stream.msgtype != IMU or abs(fit.offset_deg) < _RELATIVE_DEG or quarter)
         and follows_turning(turning, stamps_ns, _in_enu(angle, fit.convention))
     )
+    by_turns = sideways and not quarter  # no course tells how it is mounted
     return CompassReport(
         **plain,
         usable=fits_course or sideways,
         convention=fit.convention,
-        offset_deg=None if sideways and not quarter else fit.offset_deg,
+        offset_deg=None if by_turns else fit.offset_deg,
         scatter_deg=fit.scatter_deg,
         leeway_deg=None
-        if sideways and not quarter
+        if by_turns
         else _wanders_deg(courses.stamps_ns, _ahead(fit.apart_rad, np.radians(fit.offset_deg))),
         samples=len(fit.apart_rad),
         why=_why(fit, by_gyro, told=told is not None, fits_course=fits_course, sideways=sideways),

@@ -130,10 +130,9 @@ def _missing(setup: Setup, recording: Recording, datum: Datum, *, patient: bool)
         sigma_m = np.array([h.p_sigma_m[:2] for h, of in zip(places, names, strict=True) if of == name])
         noises.append((sigma_m, kinds[config.kind].slow(config)))
     usual_m, least_m = wanted_travel_m(noises)
-    travelled_m = float(np.hypot(*(p - np.median(p[:5], axis=0)).T).max())
-    if travelled_m > (least_m if patient else usual_m):
-        return "", travelled_m > usual_m
-    wanted_m = least_m if patient else usual_m
+    wanted_m, travelled_m = least_m if patient else usual_m, np.hypot(*(p - np.median(p[:5], axis=0)).T).max()
+    if travelled_m > wanted_m:
+        return "", bool(travelled_m > usual_m)
     return f"a heading: from a sensor, from `start.heading_deg`, or from {wanted_m:.0f} m of travel", False
 
 
