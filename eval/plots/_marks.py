@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -157,7 +156,9 @@ def peaks(values: Array, most: int = MOST) -> NDArray[np.int64]:
     if n <= most:
         return np.arange(n)
     edges = np.linspace(0, n, most + 1).round().astype(np.int64)
-    return np.array([a + int(np.argmax(values[a:b])) for a, b in pairwise(edges)], dtype=np.int64)
+    largest = np.repeat(np.maximum.reduceat(values, edges[:-1]), np.diff(edges))
+    at = np.flatnonzero((values == largest) | np.isnan(values))
+    return at[np.searchsorted(at, edges[:-1])]
 
 
 def shown_of(weight: Array, most: int = MOST) -> NDArray[np.int64]:
