@@ -132,11 +132,11 @@ def test_what_closes_a_chain_is_taken_out_as_it_weighs(value: tuple[float, float
 
 
 def jumped(
-    begin_s: float, end_s: float, seed: int, length_s: float = 60.0
+    begin_s: float, end_s: float, seed: int, length_s: float = 60.0, gnss_hz: float = 2.0
 ) -> tuple[SimulatedRun, Recording, VesselConfig]:
     """Fixes, compass and velocities (0.1 m/s); the fixes 11 m off for a while."""
     run = simulate(
-        Scenario(path="loops", duration_s=length_s, noise="clean", imu_hz=50.0, gnss_hz=4.0, compass_hz=1.0), seed
+        Scenario(path="loops", duration_s=length_s, noise="clean", imu_hz=50.0, gnss_hz=gnss_hz, compass_hz=1.0), seed
     )
     imu, truth, rng = run.recording.imu, run.truth, np.random.default_rng(seed)
     assert imu is not None
@@ -162,7 +162,7 @@ def jumped(
     velocity = VelocityConfig(topic="/velocity", mount=run.config.sensors["gnss"].mount)
     sensors = {n: s for n, s in run.config.sensors.items() if n != "matcher"} | {"velocity": velocity}
     recording = replace(run.recording, measurements=measurements, message_count=len(imu) + len(measurements))
-    return run, recording, with_few_states(run.config.model_copy(update={"sensors": sensors}), rate_hz=2.5)
+    return run, recording, with_few_states(run.config.model_copy(update={"sensors": sensors}), rate_hz=1.25)
 
 
 @pytest.mark.parametrize(("begin_s", "end_s", "online"), [(44.0, 60.0, True), (44.0, 60.0, False), (20.0, 34.0, True)])
@@ -178,7 +178,7 @@ def test_fixes_and_velocities_do_not_follow_a_jump(begin_s: float, end_s: float,
 
 def test_a_driver_that_hangs_says_nothing_new() -> None:
     """It repeats positions and velocities for 30 s, and goes on near where it hung: the track followed the velocities, 80 to 110 m off."""
-    run, recording, config = jumped(0.0, 0.0, 4, length_s=70.0)
+    run, recording, config = jumped(0.0, 0.0, 4, length_s=70.0, gnss_hz=4.0)
     assert recording.imu is not None
     begin_ns = int(recording.imu.stamps_ns[0]) + 25 * NS_PER_S
     hangs = next(f for f in script(recording)[0] if f.name == "GNSS frozen, 30 s").on(recording, begin_ns, 0).recording

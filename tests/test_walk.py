@@ -45,7 +45,13 @@ def test_one_at_each_node_is_where_the_node_is(apart_s: float) -> None:
 def test_bounds_hold_beside_fixes_good_to_centimetres_that_walk() -> None:
     """By 0.15 m in a second, which is less than is expected of them (0.2 m)."""
     scenario: Scenario = replace(
-        bl_scenario(1, "clean"), duration_s=80.0, imu_hz=50.0, gnss_hz=5.0, gnss_sigma_m=0.03, false_fraction=0.0
+        bl_scenario(1, "clean"),
+        duration_s=60.0,
+        imu_hz=50.0,
+        gnss_hz=5.0,
+        compass_hz=1.0,
+        gnss_sigma_m=0.03,
+        false_fraction=0.0,
     )
     run = simulate_slowly(scenario, 4, rate_hz=2.5)
     rng, walked, fixes = np.random.default_rng(6), np.zeros(3), []
