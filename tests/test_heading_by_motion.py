@@ -128,7 +128,7 @@ class Guess:
 @pytest.fixture(scope="module")
 def guess() -> Guess:
     ahead_m = 4.0
-    recording, config, t, yaw = robot(0, 45.0, rate_hz=1.0)
+    recording, config, t, yaw = robot(0, 45.0, rate_hz=0.625)
     gnss = config.sensors["gnss"]
     mount = gnss.mount.model_copy(update={"xyz_m": (ahead_m, 0.0, 0.0)})
     solved = app.smooth_recording(
@@ -426,7 +426,7 @@ def test_a_noise_that_is_configured_too_small_excludes_no_headings() -> None:
 
 def test_a_leg_takes_no_guess_as_known() -> None:
     """What the leg before could not tell is no heading to start the next one with."""
-    recording, config, _, _ = robot(0, 65.0, rate_hz=1.25)
+    recording, config, _, _ = robot(0, 65.0, rate_hz=0.625)
     in_legs = config.model_copy(update={"timeline": config.timeline.model_copy(update={"leg_s": 30.0})})
     solved = app.smooth_recording(recording, in_legs).solution
     assert any("solved in 3 overlapping legs" in line for line in (*solved.stats.events, *solved.stats.warnings))

@@ -126,7 +126,7 @@ def test_it_is_left_out_only_where_a_motion_of_a_vessel_explains_the_denials(
 
 
 def smoothed(
-    change: Change, from_s: float = 12.0, until_s: float = 16.0, rate_hz: float = 2.5
+    change: Change, from_s: float = 12.0, until_s: float = 16.0, rate_hz: float = 1.25
 ) -> tuple[Solution, Recording, TrackErrors]:
     """The same offline."""
     run = slowly(run_of(), rate_hz)
@@ -146,7 +146,7 @@ def smoothed(
 
 @pytest.mark.parametrize("change", [axes_swapped, in_g])
 def test_offline_it_is_left_out_where_it_is_wrong(change: Change) -> None:
-    solution, recording, off = smoothed(change, rate_hz=1.25)
+    solution, recording, off = smoothed(change)
     assert np.linalg.norm(off.position_m[:, :2], axis=1).max() < 1.0
     assert np.abs(off.heading_rad).max() < np.radians(8.0)
     (said,) = (w for w in solution.stats.warnings if "contradicts the other sensors, which agree" in w)
@@ -161,7 +161,7 @@ def test_offline_it_is_left_out_where_it_is_wrong(change: Change) -> None:
 
 def test_offline_it_is_found_in_the_first_window() -> None:
     """Aligned to rates that are wrong there, the run ended 122 m and 180 deg off, and took 15 times as long."""
-    solution, _, off = smoothed(in_degrees, 6.0, 9.0, rate_hz=1.25)
+    solution, _, off = smoothed(in_degrees, 6.0, 9.0, rate_hz=0.625)
     assert np.linalg.norm(off.position_m[:, :2], axis=1).max() < 1.0
     assert np.abs(off.heading_rad).max() < np.radians(8.0)
     assert any("contradicts the other sensors, which agree" in w for w in solution.stats.warnings)

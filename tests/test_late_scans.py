@@ -40,15 +40,13 @@ from tests.test_inspect import drive
 from tests.test_inspect_sources import cloud
 from tests.test_online_faults import smoother
 
-SCENARIO = Scenario(
-    path="loops", duration_s=60.0, noise="clean", false_fraction=0.0, gnss_hz=2.0, imu_hz=50.0, compass_hz=2.0
-)
+SCENARIO = Scenario(path="loops", noise="clean", false_fraction=0.0, gnss_hz=2.0, imu_hz=50.0, compass_hz=2.0)
 
 
 @cache
-def late(stamp_sigma_s: float, late_s: float) -> SimulatedRun:
+def late(stamp_sigma_s: float, late_s: float, duration_s: float = 60.0) -> SimulatedRun:
     """A run with matches good to 0.2 m and 0.5 deg, each stamped `late_s` after its scan was taken."""
-    run = simulate(SCENARIO, 3)
+    run = simulate(replace(SCENARIO, duration_s=duration_s), 3)
     late_ns = round(late_s * 1e9)
     moved = [
         replace(m, stamp_ns=m.stamp_ns + late_ns) if isinstance(m, PoseFix) else m for m in run.recording.measurements
@@ -56,7 +54,7 @@ def late(stamp_sigma_s: float, late_s: float) -> SimulatedRun:
     recording = replace(run.recording, measurements=tuple(sorted(moved, key=lambda m: (m.stamp_ns, m.seq))))
     (name,) = run.config.of_kind("pose")
     config = run.config.with_sensors({name: AerialConfig(image_sigma_m=0.0, stamp_sigma_s=stamp_sigma_s)})
-    return replace(run, recording=recording, config=with_few_states(config, 2.5))
+    return replace(run, recording=recording, config=with_few_states(config, 1.25))
 
 
 @cache
@@ -210,7 +208,7 @@ def test_a_clock_that_recording_times_contradict_is_said(
 
 def test_a_delay_that_was_found_goes_on_after_a_restart(tmp_path: Path) -> None:
     """And is given up where the configuration now has it, or none to estimate."""
-    run, path = late(0.05, 0.15), tmp_path / "snapshot.json"
+    run, path = late(0.05, 0.15, 45.0), tmp_path / "snapshot.json"
     came = arrivals_of(run)
     feed(smoother(run, snapshot=path), run, came[: 3 * len(came) // 4])
     (name,) = run.config.of_kind("aerial")
@@ -282,7 +280,7 @@ def test_a_clock_that_is_not_the_recorders_is_drafted_and_beside_a_smaller_sigma
 
 @pytest.mark.parametrize("mode", ["offline", "online"])
 def test_no_pose_is_good_beside_a_clock_in_doubt(mode: str) -> None:
-    run = late(0.05, 0.0)
+    run = late(0.05, 0.0, 15.0)
     recording = replace(run.recording, clock_doubts=("aerial: by the recording times",))
     done = app.smooth_recording if mode == "offline" else app.replay_recording
     found = done(recording, run.config).solution

@@ -209,7 +209,7 @@ def test_a_figure_that_each_leg_finds_anew_is_said_once(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(graphloc.solve, "make_solution", noted)
     imu = run.config.sensors["imu"].model_copy(update={name: 0.1 * value for name, value in noisy.items()})
-    found = solved(replace(run, config=run.config.with_sensors({"imu": imu})), 30.0)
+    found = solved(replace(run, config=run.config.with_sensors({"imu": imu})), 30.0, rate_hz=0.625)
     assert len(set(lines)) == 2  # or there is nothing to join
     (said,) = (w for w in found.stats.warnings if "configured too small" in w)
     assert said == f"{max(lines, key=times)} (the worst of 2 parts of the run that show this)"

@@ -16,7 +16,7 @@ from graphloc import app, origin
 from graphloc.build import make_problem
 from graphloc.config import GnssConfig, PoseConfig
 from graphloc.eval.metrics import compare_to_truth
-from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic
 from graphloc.graph import Residual
@@ -32,7 +32,7 @@ from graphloc.solve._batch import solve_batch
 from graphloc.solve._sensor_noise import Pair, Step, times_stated
 from graphloc.time import stamps_of
 from tests.faults import Fed, arrivals_of, feed
-from tests.slowly import simulate_slowly, slowly
+from tests.slowly import simulate_slowly
 from tests.test_factors import attachment
 
 SECOND = 1_000_000_000
@@ -55,7 +55,9 @@ def stating(run: SimulatedRun, kind: type[Measurement], share: float) -> Simulat
 
 def matched(seed: int, duration_s: float = 40.0, rate_hz: float = 2.5) -> SimulatedRun:
     """BL's case 1 with matches of 0.3 m, 40 % of them false, and GNSS that drifts."""
-    scenario = replace(bl_scenario(1, "drift"), duration_s=duration_s, pose_hz=4.0, imu_hz=50.0, gnss_hz=5.0)
+    scenario = replace(
+        bl_scenario(1, "drift"), duration_s=duration_s, pose_hz=4.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=2.0
+    )
     return simulate_slowly(scenario, seed, rate_hz)
 
 
@@ -168,8 +170,16 @@ def test_online_the_kernel_of_fixes_is_found_anew_by_their_new_sigma(monkeypatch
 
 def test_fixes_that_state_a_tenth_of_their_noise_are_taken_as_they_scatter() -> None:
     """Of a lone receiver: believed, they drew the track after their noise."""
-    scenario = replace(bl_scenario(1, "clean"), duration_s=40.0, pose_hz=0.0, gnss_sigma_m=0.5)
-    run = stating(slowly(simulate(scenario, 3)), GnssPosition, 0.1)
+    scenario = replace(
+        bl_scenario(1, "clean"),
+        duration_s=30.0,
+        pose_hz=0.0,
+        imu_hz=50.0,
+        gnss_hz=5.0,
+        compass_hz=1.0,
+        gnss_sigma_m=0.5,
+    )
+    run = stating(simulate_slowly(scenario, 3, 1.25), GnssPosition, 0.1)
     solution = app.smooth_recording(run.recording, run.config).solution
     (said,) = (w for w in solution.stats.warnings if "scatter more than they state" in w)
     assert re.match(r"gnss: .* sigma_scale: ([0-9.]+)$", said)
@@ -183,7 +193,7 @@ def test_a_start_by_the_motion_blames_fixes_that_scatter() -> None:
     scenario = Scenario(
         path="loops", duration_s=25.0, noise="clean", pose_hz=0.0, compass_hz=0.0, imu_hz=50.0, gnss_hz=1.0, gnss_sigma_m=0.8
     )  # fmt: skip
-    run = stating(slowly(simulate(scenario, 3)), GnssPosition, 0.125)
+    run = stating(simulate_slowly(scenario, 3, 1.0), GnssPosition, 0.125)
     datum = origin.choose_datum(run.recording, run.config, SENSORS)
     found = solve_batch(make_problem(run.recording, run.config, datum, SENSORS, INERTIAL), newest=True)
     (gnss,) = found.problem.streams
@@ -230,8 +240,16 @@ def test_what_a_start_finds_is_handed_on(tmp_path: Path) -> None:
 
 def test_floors_are_raised_with_the_factor() -> None:
     """Of fixes that state a micrometre, the factor alone would have to be 300 000 to be felt; all rounds were used up, and none left for the IMU."""
-    scenario = replace(bl_scenario(1, "clean"), duration_s=40.0, pose_hz=0.0, gnss_sigma_m=0.3)
-    run = stating(slowly(simulate(scenario, 3)), GnssPosition, 1e-6 / 0.3)
+    scenario = replace(
+        bl_scenario(1, "clean"),
+        duration_s=30.0,
+        pose_hz=0.0,
+        imu_hz=50.0,
+        gnss_hz=5.0,
+        compass_hz=1.0,
+        gnss_sigma_m=0.3,
+    )
+    run = stating(simulate_slowly(scenario, 3, 1.25), GnssPosition, 1e-6 / 0.3)
     said = app.smooth_recording(run.recording, run.config).solution.stats.warnings
     (line,) = (w for w in said if "scatter more than they state" in w)
     found = {key: float(value) for key, value in re.findall(r"(\w+): ([0-9.]+)", line)}

@@ -111,7 +111,7 @@ def test_an_antenna_of_unknown_place_stays_where_it_is_found(monkeypatch: pytest
     gnss = config.sensors["gnss"]
     lever_m = gnss.mount.t_body_sensor_m - [2.0, 1.0, 0.0]
     elsewhere = {"mount": MountConfig(xyz_m=tuple(lever_m)), "mount_sigma_m": 2.0}
-    config = with_few_states(config.with_sensors({"gnss": gnss.model_copy(update=elsewhere)}), 2.0)
+    config = with_few_states(config.with_sensors({"gnss": gnss.model_copy(update=elsewhere)}), 1.0)
     antenna, heading = [], []
     for _ in range(2):
         solution = app.smooth_recording(recording, config).solution
