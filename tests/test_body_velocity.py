@@ -129,7 +129,7 @@ def silent(seed: int, log_hz: float) -> SimulatedRun:
         path="loops", noise="drift", duration_s=51.0, outage_s=(20.0, 50.0), log_hz=log_hz,
         imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0,
     )  # fmt: skip
-    return simulate_slowly(scenario, seed, rate_hz=2.5)
+    return simulate_slowly(scenario, seed, rate_hz=1.25)
 
 
 def test_a_log_holds_the_track_while_gnss_is_silent() -> None:

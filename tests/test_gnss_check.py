@@ -116,4 +116,4 @@ def test_poses_all_off_by_five_metres_are_reported(run: SimulatedRun) -> None:
         assert found
         assert float(found[1]) == pytest.approx(5.0, abs=0.3)
         assert float(found[2]) == pytest.approx(180.0 + np.degrees(np.arctan2(3.0, 4.0)), abs=4.0)
-    assert not [w for w in app.simulated(run).recording.warnings if "constant offset" in w]
+    assert not [w for w in app.smooth_recording(run.recording, run.config).recording.warnings if "constant offset" in w]

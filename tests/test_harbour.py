@@ -377,6 +377,7 @@ def test_gnss_errors_are_those_of_the_thesis(name: str, rmse_m: float, largest_m
     assert largest == pytest.approx(largest_m, rel=0.1)
 
 
+@pytest.mark.usefixtures("coarse_image")
 def test_the_recording_is_whole_and_smooths(tmp_path: Path) -> None:
     bag, config = write_bag(simulate(replace(SHORT, duration_s=8.0), 4), tmp_path / "sim", ros=2)
     assert {p.name for p in (tmp_path / "sim").iterdir()} == {

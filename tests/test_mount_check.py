@@ -16,7 +16,16 @@ from graphloc.solution import Health
 from graphloc.trajectory import Trajectory
 from tests.slowly import simulate_slowly
 
-QUICK = Scenario(path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, gnss_sigma_m=0.1)
+QUICK = Scenario(
+    path="loops",
+    duration_s=60.0,
+    noise="clean",
+    pose_hz=0.0,
+    imu_hz=50.0,
+    gnss_hz=2.0,
+    compass_hz=2.0,
+    gnss_sigma_m=0.1,
+)
 
 
 @pytest.fixture(scope="module")

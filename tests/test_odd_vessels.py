@@ -20,6 +20,7 @@ from graphloc.measurements import GnssPosition
 from graphloc.thinning import THINNED
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import Item, Messages, write_bag
+from tests.slowly import with_few_states
 
 ANTENNA_M = np.array([-1.5, 0.3, 2.2789])  # where the simulator has it
 FORWARD_RIGHT_DOWN = Rotation.from_euler("x", 180.0, degrees=True)
@@ -102,6 +103,7 @@ def test_from_a_draft_to_a_track(kind: str, heading_deg: float, tmp_path: Path) 
     draft = tmp_path / "vessel.yaml"
     draft.write_text(draft_config(inspect_bag(bag)))
     recording, config = app.load([bag], draft)
+    config = with_few_states(config)
     assert {s.kind for s in config.sensors.values() if s.enabled} == {"imu", "gnss", kind}
     solved = app.smooth_recording(recording, config)
     ours = compare_to_truth(solved.solution.trajectory, world_of(solved, run))

@@ -26,7 +26,9 @@ from graphloc.trajectory import Trajectory
 @pytest.fixture(scope="module")
 def data() -> ReportData:
     """A run whose offline and online tracks are the truth, with 1 m of sigma, and no filter beside them."""
-    found = app.report_data(app.simulated(simulate(Scenario(duration_s=20.0), 3), compare=True))
+    found = app.report_data(
+        app.simulated(simulate(Scenario(duration_s=20.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3), compare=True)
+    )
     truth, online = found.recording.truth, found.online
     assert truth is not None
     assert online is not None
