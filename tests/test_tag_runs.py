@@ -31,7 +31,7 @@ from tests.slowly import beside_filters, with_few_states
 S = 1_000_000_000
 QUAY = (226, 227, 228)
 HZ = 1.0  # of the images
-_LESS = {"imu_hz": "50", "gnss_hz": "2", "compass_hz": "4", "lidar_hz": "0", "camera_hz": "0"}
+_LESS = {"imu_hz": "50", "gnss_hz": "2", "compass_hz": "2", "lidar_hz": "0", "camera_hz": "0"}
 
 Sightings = list[tuple[TagSighting, int]]
 Change = Callable[[Measurement], Measurement | None]
