@@ -2,7 +2,9 @@
 """A vehicle without a heading sensor: as sure of its heading as its motion tells it, and no surer."""
 
 import sys
+from collections import Counter
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,7 @@ from graphloc.factors import INERTIAL, SENSORS
 from graphloc.factors import gnss as factors_gnss
 from graphloc.frames import Array, Geodetic, heading_deg_from_yaw, wrap_angle
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSample
-from graphloc.online import OnlineSmoother, _smoother, _waiting
+from graphloc.online import OnlineSmoother, _heading_check, _smoother, _waiting
 from graphloc.online import _start as online_start
 from graphloc.online._heading_check import Fit, HeadingCheck
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
@@ -27,17 +29,26 @@ from graphloc.solution import Cause, Health, Solution
 from graphloc.solve import _align, _start
 from graphloc.solve._align import align, wanted_travel_m
 from graphloc.solve._start import solve_start
+from graphloc.trajectory import bounds_95
 from tests.slowly import with_few_states
 
 IMU_HZ, ACCEL_NOISE, GYRO_NOISE, FIX_M = 25.0, 0.05, 0.003, 0.3  # noise densities: m/s^2, rad/s per sqrt(Hz)
 
 
 def robot(
-    seed: int, duration_s: float, *turns_at_s: float, speed_mps: float = 1.0, spins_s: float = 0.0, rate_hz: float = 2.5
+    seed: int,
+    duration_s: float,
+    *turns_at_s: float,
+    speed_mps: float = 1.0,
+    spins_s: float = 0.0,
+    rate_hz: float = 2.5,
+    fix_m: float = FIX_M,
+    ahead_m: float = 0.0,
 ) -> tuple[Recording, VesselConfig, Array, Array]:
     """Drive straight, by default at a walking pace, and turn by 90 deg within 3 s at some moments.
 
-    `spins_s`: so long it first turns on the spot, at 0.06 rad/s, then it gathers speed for 4 s.
+    `spins_s`: so long it first turns on the spot, at 0.06 rad/s, then it gathers speed for 4 s. `fix_m`: noise of fixes. `ahead_m`: the
+    antenna is as far ahead.
 
     Returns:
         The recording, its configuration, and the true yaw (N,), rad, at times (N,), s, since the first sample.
@@ -52,6 +63,7 @@ def robot(
     yaw = rng.uniform(-np.pi, np.pi) + np.cumsum(rate) / IMU_HZ
     v = speed[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(t))])
     p = np.cumsum(v, axis=0) / IMU_HZ
+    antenna = p + ahead_m * np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(t))])
     force = np.column_stack([np.gradient(speed, t), speed * rate, np.full(len(t), 9.80665)])
     gyro = np.column_stack([np.zeros((len(t), 2)), rate])
     template = simulate(Scenario(path="still", duration_s=6.0, imu_hz=20.0, gnss_hz=2.0, pose_hz=0.0), 0)
@@ -69,8 +81,8 @@ def robot(
     datum = app.choose_datum(template.recording, template.config)
     fixes = tuple(
         replace(
-            fix, seq=10**6 + k, stamp_ns=int(stamps_ns[k]), cov_enu_m2=FIX_M**2 * np.eye(3),
-            position=Geodetic(*datum.geodetic_from_enu(p[k] + FIX_M * rng.standard_normal(3))[0]),
+            fix, seq=10**6 + k, stamp_ns=int(stamps_ns[k]), cov_enu_m2=fix_m**2 * np.eye(3),
+            position=Geodetic(*datum.geodetic_from_enu(antenna[k] + fix_m * rng.standard_normal(3))[0]),
         )
         for k in range(0, len(t), int(IMU_HZ / 2.0))
     )  # fmt: skip
@@ -348,6 +360,59 @@ def test_online_tries_with_a_measured_heading_disturb_no_estimate(fails: bool, m
     assert not any("rebuilt" in event.text for event in told)
     assert any("sensors measure the heading" in event.text for event in told) != fails
     assert sum(solved) == (1 if fails else 2)  # it starts anew with the start that showed that it can
+
+
+@pytest.mark.usefixtures("short_wait")
+def test_online_what_a_guess_has_bent_is_gone_once_the_motion_tells_the_heading(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A slow robot with fixes good to 2 cm, its antenna 0.8 m from where it is said to be, to 1 m.
+
+    The antenna's place and the gyroscope's bias are estimated in the axes of the guess; corrected in the window, they stayed there. Begun
+    anew with the last minute: good and in its bounds, and each measurement has one row in the ledger.
+    """
+    monkeypatch.setattr(sys.modules[__name__], "ACCEL_NOISE", 0.01)
+    monkeypatch.setattr(sys.modules[__name__], "IMU_HZ", 100.0)
+    recording, config, t, yaw = robot(4, 100.0, *np.arange(22.0, 100.0, 9.0), speed_mps=0.5, fix_m=0.02, ahead_m=-0.8)
+    gnss = config.sensors["gnss"].model_copy(update={"mount_sigma_m": 1.0})
+    run = app.replay_recording(recording, config.with_sensors({"gnss": gnss}))
+    track, health = run.solution.trajectory, run.solution.health
+    assert any("the motion tells the heading, which was a guess" in line for line in run.solution.stats.events)
+    assert health[0] is Health.LOST
+    since = health.index(Health.GOOD)
+    assert set(health[since:]) == {Health.GOOD}
+    assert recording.imu is not None
+    assert track.cov is not None
+    at_s = (track.stamps_ns - recording.imu.stamps_ns[0]) * 1e-9
+    assert at_s[since] < 70.0
+    true = np.cumsum(0.5 / IMU_HZ * np.column_stack([np.cos(yaw), np.sin(yaw)]), axis=0)
+    off_m = np.hypot(*(track.p_world_m[:, :2] - np.column_stack([np.interp(at_s, t, axis) for axis in true.T])).T)
+    assert np.mean(off_m[since:] < bounds_95(track.cov)[since:, 0]) > 0.9
+    error, sigma = errors(run.solution, recording, t, yaw)
+    assert np.abs(error[since:] / sigma[since:]).max() < 3.0
+    rows = Counter(row.seq for row in run.solution.ledger)
+    assert set(rows.values()) == {1}
+    assert len(rows) == len(recording.imu.stamps_ns) + len(recording.measurements)
+
+
+@pytest.mark.usefixtures("short_wait")
+def test_online_a_check_of_the_heading_ends_no_guess_that_the_data_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A check that fits, but a start with all that it looked at knows the heading no better: tried every 5 s, a guess meanwhile."""
+    recording, config, *_ = robot(3, 34.0, speed_mps=8.0)
+    tried_ns = list[int]()
+
+    def denied(*given: Any) -> Any:
+        if given[4] is None:
+            return online_start.try_start(*given)
+        tried_ns.append(int(given[1].stamps_ns[-1]))
+        return SimpleNamespace(heading=object())
+
+    monkeypatch.setattr(_smoother, "try_start", denied)
+    monkeypatch.setattr(_heading_check, "_within_rad", lambda _: 0.1)
+    solved = app.replay_recording(recording, config).solution
+    assert {reason.cause for reason in solved.health_reason} == {Cause.GUESSED_HEADING}
+    assert len(tried_ns) > 2
+    assert np.diff(tried_ns).min() >= 5e9
 
 
 def failing(*_: object) -> None:

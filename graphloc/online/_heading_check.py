@@ -3,10 +3,10 @@
 
 Over 40 s, with places as complex numbers, east + i north:
 
-    z(t) = a + b t + c t^2 + d t^3 + f x2(t) + g x3(t) + rho s(t)
+    z(t) = a + b t + c t^2 + d t^3 + f x2(t) + g x3(t) + h x1(t) + rho s(t)
 
-s: the specific force in axes propagated by the gyroscope, integrated twice, plus the lever arm; x2, x3: exp(i yaw), integrated
-twice and three times. a, b: position and velocity; c, d: gravity, by a tilt that is wrong or changes; f, g: biases of the
+s: the specific force in axes propagated by the gyroscope, integrated twice, plus the lever arm; x1, x2, x3: exp(i yaw), as it is,
+integrated twice and three times. h: where the antenna is off its mount, while the heading is a guess that bends its estimate. a, b: position and velocity; c, d: gravity, by a tilt that is wrong or changes; f, g: biases of the
 accelerometer and the gyroscope, about 0 and not about the estimated ones, which are wrong too where the heading is. With the
 right heading rho = 1; a heading that is off by e gives rho = exp(-i e). A gyroscope bias of 0.02 rad/s about the vertical turns
 s by 0.8 rad in 40 s: where the heading fits with the estimated bias taken off, nothing is reported. So a compass with a wrong
@@ -111,8 +111,12 @@ class HeadingCheck:
             self._sensor = m.sensor
             self._fixes.append(_Fix(m.stamp_ns, hint.p_world_m[:2], float(hint.p_sigma_m[:2].max())))
 
-    def look(self, lag: Lag) -> bool:
-        """Integrate the IMU to the newest state and check the heading; return whether it is newly found to be wrong."""
+    def look(self, lag: Lag, *, guessed: bool = False) -> bool:
+        """Integrate the IMU to the newest state and check the heading; return whether it is newly found to be wrong.
+
+        Args:
+            guessed: the heading is a guess, and where the window has the antenna is bent by it.
+        """
         newest = lag.newest
         self._carry_on(lag, newest)
         since_ns = newest.stamp_ns - self.looked_ns
@@ -122,7 +126,7 @@ class HeadingCheck:
         if self._sensor not in lag.problem.streams:
             return False
         # Not with the estimated bias, which a guess has bent until it fits.
-        fit = self._fit(lag, newest, np.zeros(3))
+        fit = self._fit(lag, newest, np.zeros(3), any_place=guessed)
         self.within_rad = _within_rad(fit)
         found = _off(fit)
         if found is None:
@@ -176,13 +180,15 @@ class HeadingCheck:
         while self._fixes and self._fixes[0].stamp_ns < begin_ns:
             self._fixes.popleft()
 
-    def _fit(self, lag: Lag, newest: Newest, drift_radps: Array) -> Fit | None:
+    def _fit(self, lag: Lag, newest: Newest, drift_radps: Array, *, any_place: bool = False) -> Fit | None:
         """Return how the fixes follow the accelerations; None where there are too few.
 
         Args:
-            drift_radps: (3,) gyroscope bias to take off, body axes.
+            drift_radps: (3,) gyroscope bias to take off, body axes. any_place: the antenna is anywhere about its mount.
         """
-        at_s, felt = self._felt(lag, newest, drift_radps)
+        # What measures whole poses has no antenna.
+        place_m = getattr(lag.problem.streams[self._sensor].config, "mount_sigma_m", 0.0) if any_place else 0.0
+        at_s, felt = self._felt(lag, newest, drift_radps, place_m)
         fixes = [fix for fix in self._fixes if self._steps[0].until_ns <= fix.stamp_ns <= newest.stamp_ns]
         if at_s[-1] - at_s[0] < 0.9 * _WINDOW_S or len(fixes) < _FEWEST:
             return None
@@ -200,26 +206,37 @@ class HeadingCheck:
         moved, terms = free[:, 0], free[:, 1:]
         left = moved - terms @ np.linalg.lstsq(terms, moved, rcond=None)[0]
         variance = float(np.mean(np.abs(left) ** 2)) * len(z) / (_WINDOW_S / _APART_S)  # of a fix, as all go together
-        information = terms.conj().T @ terms / variance + np.diag([0.0, *(1.0 / _BIASES**2)])
+        known = _BIASES if not place_m else np.append(_BIASES, place_m)
+        information = terms.conj().T @ terms / variance + np.diag([0.0, *(1.0 / known**2)])
         rho = complex(np.linalg.solve(information, terms.conj().T @ moved / variance)[0])
         sigma = float(np.sqrt(np.linalg.inv(information)[0, 0].real))
         return Fit(rho, sigma)
 
-    def _felt(self, lag: Lag, newest: Newest, drift_radps: Array) -> tuple[Array, Array]:
-        """Return times (N,), s, relative to the newest state, and s, x2 and x3 (3, N), complex, in world."""
-        lever, R, v, p, places, ahead = _lever_m(lag, self._sensor), np.eye(3), np.zeros(3), np.zeros(3), [], []
+    def _felt(self, lag: Lag, newest: Newest, drift_radps: Array, place_m: float) -> tuple[Array, Array]:
+        """Return times (N,), s, relative to the newest state, and s, x2, x3 and, with a `place_m`, x1 (3 or 4, N), complex, in world.
+
+        Args:
+            drift_radps: as in `_fit`. place_m: how far from its mount the antenna may be, 1 sigma; 0: it is where the window has it.
+        """
+        lever = _mount_m(lag, self._sensor) if place_m else _lever_m(lag, self._sensor)
+        R, v, p, places, ahead = np.eye(3), np.zeros(3), np.zeros(3), [], []
         for step in self._steps:
             dt_s = (step.until_ns - step.from_ns) * 1e-9
             p, v = p + v * dt_s + R @ step.dp, v + R @ step.dv
             R = R @ step.dR @ gtsam.Rot3.Expmap(-drift_radps * dt_s).matrix()
             places.append(p + R @ lever)
-            ahead.append(R[:, 0] * dt_s)
+            ahead.append(R[:, 0])
         in_world = newest.pose.rotation().matrix() @ R.T
         place, x = (np.array(of) @ in_world[:2].T @ np.array([1.0, 1j]) for of in (places, ahead))
         dt = np.array([step.until_ns - step.from_ns for step in self._steps]) * 1e-9
-        twice = np.cumsum(np.cumsum(x) * dt)
+        twice = np.cumsum(np.cumsum(x * dt) * dt)
         at_s = (np.array([step.until_ns for step in self._steps]) - newest.stamp_ns) * 1e-9
-        return at_s, np.array([place, twice, np.cumsum(twice * dt)])
+        return at_s, np.array([place, twice, np.cumsum(twice * dt), *([x] if place_m else [])])
+
+
+def _mount_m(lag: Lag, receiver: str) -> Array:
+    """Return where an antenna's mount is from the IMU (3,), m, body axes."""
+    return np.asarray(lag.problem.streams[receiver].mount.translation())
 
 
 def _lever_m(lag: Lag, receiver: str) -> Array:

@@ -37,11 +37,12 @@ class Recent:
         """Keep a measurement, whatever its stamp."""
         self._came.append(m)
 
-    def keep_anchor(self, lag: Lag, keep_ns: Sequence[tuple[int, int]] = ()) -> bool:
+    def keep_anchor(self, lag: Lag, keep_ns: Sequence[tuple[int, int]] = (), since_ns: int | None = None) -> bool:
         """Keep the newest state as an anchor if one is due, and forget what is older than the oldest anchor; return whether it was due.
 
         Args:
             keep_ns: spans (stamps) of which IMU samples are kept, however old.
+            since_ns: stamp from which all is kept, however old; None: from the oldest anchor.
         """
         at_ns, anchors = lag.newest.stamp_ns, self.anchors
         if anchors and at_ns - anchors[-1].stamp_ns < _EVERY_S * 1e9:
@@ -49,11 +50,9 @@ class Recent:
         anchors.append(lag.anchor())
         while anchors[0].stamp_ns < lag.first_ns:
             anchors.popleft()
-        kept = []
+        kept, first_ns = [], anchors[0].stamp_ns if since_ns is None else min(since_ns, anchors[0].stamp_ns)
         for m in self._came:
-            if m.stamp_ns >= anchors[0].stamp_ns or (
-                isinstance(m, ImuSample) and any(a <= m.stamp_ns <= b for a, b in keep_ns)
-            ):
+            if m.stamp_ns >= first_ns or (isinstance(m, ImuSample) and any(a <= m.stamp_ns <= b for a, b in keep_ns)):
                 kept.append(m)
             elif isinstance(m, ImuSample) and (self._before is None or m.stamp_ns > self._before.stamp_ns):
                 self._before = m

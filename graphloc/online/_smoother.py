@@ -30,6 +30,7 @@ from graphloc.online._setup import Setup
 from graphloc.online._snapshot import SnapshotFile
 from graphloc.online._start import LEAST_S, Started, try_start
 from graphloc.online._tracking import Tracking, failure_text
+from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._waiting import Waiting
 from graphloc.origin import refuse_world_without_datum
 from graphloc.recording import Mounts
@@ -239,6 +240,7 @@ class OnlineSmoother:
         if not tracking.due(until_ns):
             return None
         try:
+            known = self._persistent.heading
             tracking.advance(until_ns)
             self._keep_anchor(tracking)
             self._events += tracking.news()
@@ -248,9 +250,8 @@ class OnlineSmoother:
             if lost_s := tracking.lag.lost_s:
                 why = f"for {lost_s:.0f} s no absolute sensor agreed, unless its error had jumped"
                 return self._start_over(tracking, until_ns - duration_ns(_AGAIN_S), why)
-            if (started := self._start_with_heading(tracking, until_ns)) is not None:
-                why = "sensors measure the heading, which was a guess"
-                return self._start_over(tracking, tracking.lag.first_ns, why, started)
+            if (again := self._start_with_heading(tracking, until_ns, known)) is not None:
+                return self._start_over(tracking, tracking.lag.first_ns, *again)
             if jumped := tracking.lag.unmodelled_jumps:
                 self._rebuild(f"position jump of {', '.join(jumped)}")
                 return self._estimate()
@@ -322,12 +323,22 @@ class OnlineSmoother:
             return None
         return self._estimate()
 
-    def _start_from(self, samples: Sequence[ImuSample], others: Sequence[Measurement], until_ns: int) -> Started | str:
-        """Return the start, or what it waits for; what lies ahead of `until_ns`, the newest sample's stamp, is left out."""
+    def _start_from(
+        self,
+        samples: Sequence[ImuSample],
+        others: Sequence[Measurement],
+        until_ns: int,
+        near_rad: float | None = None,
+    ) -> Started | str:
+        """Return the start, or what it waits for; what lies ahead of `until_ns`, the newest sample's stamp, is left out.
+
+        Args:
+            near_rad: as in `try_start`.
+        """
         reached = [m for m in others if m.stamp_ns <= until_ns]
         try:
             setup = self._setup.scaled(self._persistent.sensor_noise.times)
-            return try_start(setup, series_of(samples), reached, self.datum)
+            return try_start(setup, series_of(samples), reached, self.datum, near_rad)
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             return f"data from which the start can be solved: {in_one_line(error)}"
 
@@ -367,30 +378,55 @@ class OnlineSmoother:
         self._waiting.refuse(f"the estimate restarted while waiting for {self._waiting.why}")
         self._wait("the next IMU sample")
 
-    def _start_with_heading(self, tracking: Tracking, now_ns: int) -> Started | None:
-        """Return a start from the window's data, if sensors measure the heading by now, and it is no guess.
+    def _start_with_heading(
+        self, tracking: Tracking, now_ns: int, known: UnmeasuredHeading | None
+    ) -> tuple[str, Started, list[Measurement]] | None:
+        """Return why, the start and from what, if sensors or the motion tell a heading by now that was a guess, and it is none.
 
-        Corrected in the window, a wrong guess leaves wrong biases and velocities behind, and with them a wrong heading.
+        Corrected in the window, a wrong guess leaves wrong biases, velocities and places of antennas behind, and with them a wrong
+        heading.
+
+        Args:
+            known: how far the heading could be off before the newest state.
         """
-        guessed = self._persistent.heading is not None and self._persistent.heading.doubt(now_ns)
-        if not guessed or now_ns - self._tried_ns < duration_ns(LEAST_S) or not tracking.heading_measured():
+        if known is None or not known.doubt(now_ns):
+            return None
+        heading = self._persistent.heading
+        told = heading is None or not heading.doubt(now_ns)
+        if heading is not None and now_ns - self._tried_ns < duration_ns(LEAST_S):
+            self._persistent.heading = known if told else heading  # until the next try
+            return None
+        if told:
+            why, (came, near_rad) = "the motion tells the heading, which was a guess", tracking.told_by()
+        elif tracking.heading_measured():
+            why, near_rad = "sensors measure the heading, which was a guess", None
+            came = tracking.since(tracking.lag.first_ns)
+        else:
             return None
         self._tried_ns = now_ns
-        came = tracking.since(tracking.lag.first_ns)
         samples = [m for m in came if isinstance(m, ImuSample)]
-        started = self._start_from(samples, [m for m in came if not isinstance(m, ImuSample)], now_ns)
-        return None if isinstance(started, str) or started.heading else started
+        started = self._start_from(samples, [m for m in came if not isinstance(m, ImuSample)], now_ns, near_rad)
+        if isinstance(started, str):
+            return None
+        if started.heading and heading is not None:
+            self._persistent.heading = known  # one check alone is less than all the data that it looked at
+        return None if started.heading else (why, started, came)
 
     def _start_over(
-        self, tracking: Tracking, since_ns: int, why: str, started: Started | None = None
+        self,
+        tracking: Tracking,
+        since_ns: int,
+        why: str,
+        started: Started | None = None,
+        came: Sequence[Measurement] = (),
     ) -> Estimate | None:
-        """Start anew with what was measured since a stamp (ns); `started`: from that, where it has been solved."""
+        """Start anew with what was measured since a stamp (ns); `started`: or from `came`, where that has been solved."""
         again = tracking.end_but(since_ns)
         self._persistent.agreed_ns.update(tracking.lag.agreed_ns)
         self._say(f"{why}: restarts")
         self._wait("the next IMU sample")
         # Samples have their rows already.
-        for m in again:
+        for m in came or again:
             self._waiting.hold(replace(m, seq=-1) if isinstance(m, ImuSample) else m)
         newest = self._intake.newest
         assert newest is not None

@@ -80,8 +80,21 @@ class Started:
     rows: tuple[LedgerRow, ...]
 
 
-def try_start(setup: Setup, imu: ImuSeries, measurements: Sequence[Measurement], datum: Datum | None) -> Started | str:
-    """Return the start, or what it waits for; `datum`: origin of world, None where it is to be chosen."""
+def try_start(
+    setup: Setup,
+    imu: ImuSeries,
+    measurements: Sequence[Measurement],
+    datum: Datum | None,
+    near_rad: float | None = None,
+) -> Started | str:
+    """Return the start, or what it waits for.
+
+    Args:
+        datum: origin of world, None where it is to be chosen.
+        near_rad: yaw at the first sample where the motion has told it since: the only one that is tried, and no information.
+    """
+    if near_rad is not None:
+        setup = setup.near(near_rad)
     config = setup.config
     span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 if len(imu) else 0.0
     if span_s < LEAST_S:
@@ -103,7 +116,9 @@ def try_start(setup: Setup, imu: ImuSeries, measurements: Sequence[Measurement],
     if missing:
         return missing
     try:
-        return _solved(setup, recording, datum, told=told)
+        return _solved(
+            setup, recording, datum, told=told, carried=config.start.heading_deg is not None and near_rad is None
+        )
     except SolveError as error:
         return f"data from which the start can be solved: {error}"
 
@@ -136,8 +151,8 @@ def _missing(setup: Setup, recording: Recording, datum: Datum, *, patient: bool)
     return f"a heading: from a sensor, from `start.heading_deg`, or from {wanted_m:.0f} m of travel", False
 
 
-def _solved(setup: Setup, recording: Recording, datum: Datum, *, told: bool) -> Started | str:
-    """Return the start as the batch solver solves it, or what it waits for; `told`: whether the motion may tell its heading."""
+def _solved(setup: Setup, recording: Recording, datum: Datum, *, told: bool, carried: bool) -> Started | str:
+    """Return the start as the batch solver solves it, or what it waits for; `told`, `carried`: as in `_heading`."""
     config, rows = setup.config, setup.rows
     whole = origin.with_synthetic(recording, config, datum, rows)
     problem = make_problem(whole, config, datum, rows, setup.inertial, company_of(config, rows))
@@ -147,7 +162,7 @@ def _solved(setup: Setup, recording: Recording, datum: Datum, *, told: bool) -> 
         return "data in which the IMU and the other sensors agree"
     if span_s < _CHOICE_WAIT_S and (undecided := _undecided(problem, result)):
         return undecided
-    heading = _heading(setup, recording, datum, result, told=told)
+    heading = _heading(setup, recording, datum, result, told=told, carried=carried)
     if isinstance(heading, str):
         return heading
     heights = {
@@ -202,16 +217,20 @@ def _undecided(problem: Problem, result: BatchResult) -> str:
 
 
 def _heading(
-    setup: Setup, recording: Recording, datum: Datum, result: BatchResult, *, told: bool
+    setup: Setup, recording: Recording, datum: Datum, result: BatchResult, *, told: bool, carried: bool
 ) -> UnmeasuredHeading | str | None:
-    """Return how far the heading may be off; None where sensors or the motion tell it, a text where the start waits for it."""
+    """Return how far the heading may be off; None where sensors or the motion tell it, a text where the start waits for it.
+
+    Args:
+        told: whether the motion may tell it. carried: whether it is configured.
+    """
     problem = result.problem
     last = keys.pose(len(problem.timeline) - 1)
     R = result.values.atPose3(last).rotation().matrix()
     linear_var = world_covariance(result.tree.marginalCovariance(last), R, np.zeros(3))[5, 5]
     sigma = min(float(np.sqrt(max(linear_var, result.heading_var[-1]))), ANY_HEADING_RAD)
     last_ns, drift_radps = int(problem.timeline.stamps_ns[-1]), _vertical_bias_sigma(problem.R_body_imu, result)
-    if setup.config.start.heading_deg is not None and not _measured(setup, recording, datum):
+    if carried and not _measured(setup, recording, datum):
         why = "the heading is a guess: only `start.heading_deg` told it, and the gyroscope has carried it since"
         return UnmeasuredHeading(why=why, since_ns=last_ns, sigma_rad=sigma, drift_radps=drift_radps)
     if told and not (result.headings > 1 or sigma > DOUBTFUL_RAD):

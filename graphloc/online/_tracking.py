@@ -8,13 +8,14 @@ from bisect import insort
 from collections import deque
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate, Event
-from graphloc.frames import Array
+from graphloc.frames import Array, yaw_from_rotation
 from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample, ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
@@ -40,6 +41,7 @@ log = logging.getLogger(__name__)
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
 _PENDING = 10_000  # measurements that may wait for the IMU
 _HEADINGS, _KEPT_HEADINGS = 3, 1000  # measurements of the heading that end a guess; that are remembered
+_TOLD_S = 60.0  # of data, by which the motion may tell a heading that was a guess
 _FROZEN = "frozen receiver: it repeats one position while the vessel moves; its fixes are rejected until it moves"
 _NO_LONGER_FROZEN = "no longer frozen: its fixes are used again"
 
@@ -165,7 +167,7 @@ class Tracking:
         self._pending = [m for m in others if not self._ledger.has(m)]
         while self._pending and self._pending[0].stamp_ns < self.lag.first_ns:
             self._ledger.drop(self._pending.pop(0), Outcome.REJECTED, "no IMU data at this stamp")
-        self._recent.begin(anchor, [*samples, *self._pending])
+        self._recent.begin(anchor, [*samples, *others])
         self._extend(until_ns)
 
     def resume(self, anchor: Anchor, before: ImuSample, newest: ImuSample) -> None:
@@ -261,7 +263,10 @@ class Tracking:
 
     def keep_anchor(self) -> bool:
         """Remember the newest state as an anchor, if that is due, and forget what no rebuild needs; tell whether it was due."""
-        if not self._recent.keep_anchor(self.lag, self._doubt.told_by(self.lag.first_ns)):
+        told_ns = self._doubt.told_by(self.lag.first_ns)
+        guessed = self._persistent.heading is not None
+        since_ns = self.lag.newest.stamp_ns - duration_ns(_TOLD_S) if guessed else None
+        if not self._recent.keep_anchor(self.lag, told_ns, since_ns):
             return False
         self._ledger.forget_but({m.seq for m in self._recent})
         return True
@@ -306,6 +311,23 @@ class Tracking:
         again = (m for m in self._recent if m.stamp_ns >= stamp_ns and not self._ledger.has(m))
         return sorted(again, key=lambda m: m.stamp_ns)
 
+    def told_by(self) -> tuple[list[Measurement], float]:
+        """Return by stamp what the motion has told a heading by, and about what yaw it begins with, by the gyroscope as it is, rad.
+
+        What has a row, or gets one with the window, is without (seq -1).
+        """
+        lag = self.lag
+        since_ns = min(lag.newest.stamp_ns - duration_ns(_TOLD_S), lag.first_ns)
+        came = sorted((m for m in self._recent if m.stamp_ns >= since_ns), key=lambda m: m.stamp_ns)
+        while came and isinstance(came[0], ImuSample):
+            came.pop(0)
+        again = {m.seq for m in self.since(lag.first_ns)}
+        came = [m if m.seq in again and not isinstance(m, ImuSample) else replace(m, seq=-1) for m in came]
+        R = lag.newest.pose.rotation().matrix()
+        samples = [m for m in came if isinstance(m, ImuSample) and m.stamp_ns <= lag.newest.stamp_ns]
+        rates = np.array([m.gyro_radps for m in samples]).reshape(-1, 3) @ lag.problem.R_body_imu.T @ R[2]
+        return came, float(yaw_from_rotation(R)) - float(np.trapezoid(rates, stamps_of(samples) * 1e-9))
+
     def trajectory(self, now: Estimate) -> Trajectory:
         """Return the states of the window, and `now` where it is newer; the covariance at all of them is that of `now`."""
         stamps, p, R, v = self.lag.track()
@@ -318,7 +340,7 @@ class Tracking:
     def news(self) -> list[Event]:
         """Return what the newest state newly shows: a wrong heading, frozen receivers, position jumps, noise."""
         check, at_ns = self._persistent.heading_check, self.lag.newest.stamp_ns
-        heading = [Event(check.said)] if check.look(self.lag) else []
+        heading = [Event(check.said)] if check.look(self.lag, guessed=self._persistent.heading is not None) else []
         heading += self._heading_news()
         was, now = self._persistent.frozen, self.lag.frozen_receivers
         self._persistent.frozen = now
