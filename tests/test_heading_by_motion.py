@@ -42,13 +42,11 @@ def robot(
     speed_mps: float = 1.0,
     spins_s: float = 0.0,
     rate_hz: float = 2.5,
-    fix_m: float = FIX_M,
     ahead_m: float = 0.0,
 ) -> tuple[Recording, VesselConfig, Array, Array]:
     """Drive straight, by default at a walking pace, and turn by 90 deg within 3 s at some moments.
 
-    `spins_s`: so long it first turns on the spot, at 0.06 rad/s, then it gathers speed for 4 s. `fix_m`: noise of fixes. `ahead_m`: the
-    antenna is as far ahead.
+    `spins_s`: so long it first turns on the spot, at 0.06 rad/s, then it gathers speed for 4 s. `ahead_m`: the antenna is so far ahead.
 
     Returns:
         The recording, its configuration, and the true yaw (N,), rad, at times (N,), s, since the first sample.
@@ -81,8 +79,8 @@ def robot(
     datum = app.choose_datum(template.recording, template.config)
     fixes = tuple(
         replace(
-            fix, seq=10**6 + k, stamp_ns=int(stamps_ns[k]), cov_enu_m2=fix_m**2 * np.eye(3),
-            position=Geodetic(*datum.geodetic_from_enu(antenna[k] + fix_m * rng.standard_normal(3))[0]),
+            fix, seq=10**6 + k, stamp_ns=int(stamps_ns[k]), cov_enu_m2=FIX_M**2 * np.eye(3),
+            position=Geodetic(*datum.geodetic_from_enu(antenna[k] + FIX_M * rng.standard_normal(3))[0]),
         )
         for k in range(0, len(t), int(IMU_HZ / 2.0))
     )  # fmt: skip
@@ -371,9 +369,9 @@ def test_online_what_a_guess_has_bent_is_gone_once_the_motion_tells_the_heading(
     The antenna's place and the gyroscope's bias are estimated in the axes of the guess; corrected in the window, they stayed there. Begun
     anew with the last minute: good and in its bounds, and each measurement has one row in the ledger.
     """
-    monkeypatch.setattr(sys.modules[__name__], "ACCEL_NOISE", 0.01)
-    monkeypatch.setattr(sys.modules[__name__], "IMU_HZ", 100.0)
-    recording, config, t, yaw = robot(4, 100.0, *np.arange(22.0, 100.0, 9.0), speed_mps=0.5, fix_m=0.02, ahead_m=-0.8)
+    for name, of in {"ACCEL_NOISE": 0.01, "IMU_HZ": 100.0, "FIX_M": 0.02}.items():
+        monkeypatch.setattr(sys.modules[__name__], name, of)
+    recording, config, t, yaw = robot(4, 100.0, *np.arange(22.0, 100.0, 9.0), speed_mps=0.5, ahead_m=-0.8)
     gnss = config.sensors["gnss"].model_copy(update={"mount_sigma_m": 1.0})
     run = app.replay_recording(recording, config.with_sensors({"gnss": gnss}))
     track, health = run.solution.trajectory, run.solution.health
