@@ -376,6 +376,7 @@ def test_online_what_a_guess_has_bent_is_gone_once_the_motion_tells_the_heading(
     run = app.replay_recording(recording, config.with_sensors({"gnss": gnss}))
     track, health = run.solution.trajectory, run.solution.health
     assert any("the motion tells the heading, which was a guess" in line for line in run.solution.stats.events)
+    assert sum("one start heading tried" in line for line in run.solution.stats.events) == 1
     assert health[0] is Health.LOST
     since = health.index(Health.GOOD)
     assert set(health[since:]) == {Health.GOOD}
@@ -394,23 +395,26 @@ def test_online_what_a_guess_has_bent_is_gone_once_the_motion_tells_the_heading(
 
 
 @pytest.mark.usefixtures("short_wait")
-def test_online_a_check_of_the_heading_ends_no_guess_that_the_data_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A check that fits, but a start with all that it looked at knows the heading no better: tried every 5 s, a guess meanwhile."""
-    recording, config, *_ = robot(3, 34.0, speed_mps=8.0)
+@pytest.mark.parametrize("fails", [False, True], ids=["a guess", "failing"])
+def test_online_a_check_of_the_heading_ends_no_guess_that_the_data_do_not(
+    fails: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A check that fits, but a start with all that it looked at knows the heading no better: tried ever less often, a guess meanwhile."""
+    recording, config, *_ = robot(3, 45.0, speed_mps=8.0)
     tried_ns = list[int]()
 
     def denied(*given: Any) -> Any:
         if given[4] is None:
             return online_start.try_start(*given)
         tried_ns.append(int(given[1].stamps_ns[-1]))
-        return SimpleNamespace(heading=object())
+        return failing() if fails else SimpleNamespace(heading=object())
 
     monkeypatch.setattr(_smoother, "try_start", denied)
     monkeypatch.setattr(_heading_check, "_within_rad", lambda _: 0.1)
     solved = app.replay_recording(recording, config).solution
     assert {reason.cause for reason in solved.health_reason} == {Cause.GUESSED_HEADING}
     assert len(tried_ns) > 2
-    assert np.diff(tried_ns).min() >= 5e9
+    assert (np.diff(tried_ns) >= 5e9 * 2.0 ** np.arange(1, len(tried_ns))).all()
 
 
 def failing(*_: object) -> None:

@@ -9,12 +9,10 @@ from functools import cached_property
 
 from graphloc.build import mount_of
 from graphloc.config import ImuConfig, VesselConfig
-from graphloc.frames import Datum, heading_deg_from_yaw, yaw_from_rotation
+from graphloc.frames import Datum, yaw_from_rotation
 from graphloc.graph import Hint, InertialRow, Sensor
 from graphloc.measurements import Measurement
 from graphloc.recording import Mounts
-
-_NEAR_DEG = 60.0  # 1 sigma: next to nothing
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,10 +83,3 @@ class Setup:
     def without_start_heading(self) -> Setup:
         """Return the same for a later start: the configured heading is that of the first start alone."""
         return replace(self, config=self.config.with_start_heading(None))
-
-    def near(self, yaw_rad: float) -> Setup:
-        """Return the same for a start from about this heading."""
-        start = self.config.start.model_copy(
-            update={"heading_deg": float(heading_deg_from_yaw(yaw_rad)), "heading_sigma_deg": _NEAR_DEG}
-        )
-        return replace(self, config=self.config.model_copy(update={"start": start}))

@@ -87,7 +87,8 @@ class OnlineSmoother:
         self._say(trouble)
         self._waiting = Waiting(self._ledger)
         self._tracking: Tracking | None = None
-        self._tried_ns = 0  # to start over with a measured heading
+        # To start over with a heading that was a guess: the last try, and how often the data have denied what a check of the motion told.
+        self._tried_ns, self._denied = 0, 0
         self.antennas_off_m: Mapping[str, Array] = {}
         """How far from its mount each antenna is (3,), m, body axes, where that is estimated; known in the end (`finish`)."""
         self._wait(
@@ -289,7 +290,7 @@ class OnlineSmoother:
 
     def _wait(self, why: str) -> None:
         """Give up the estimate, and wait for a start."""
-        self._tracking, self._tried_ns = None, 0
+        self._tracking, self._tried_ns, self._denied = None, 0, 0
         self._persistent.forget_receivers()
         self._waiting.begin(why)
         self._ledger.close()
@@ -393,24 +394,23 @@ class OnlineSmoother:
             return None
         heading = self._persistent.heading
         told = heading is None or not heading.doubt(now_ns)
-        if heading is not None and now_ns - self._tried_ns < duration_ns(LEAST_S):
-            self._persistent.heading = known if told else heading  # until the next try
+        if not told and not tracking.heading_measured():
             return None
-        if told:
-            why, (came, near_rad) = "the motion tells the heading, which was a guess", tracking.told_by()
-        elif tracking.heading_measured():
-            why, near_rad = "sensors measure the heading, which was a guess", None
-            came = tracking.since(tracking.lag.first_ns)
-        else:
-            return None
-        self._tried_ns = now_ns
-        samples = [m for m in came if isinstance(m, ImuSample)]
-        started = self._start_from(samples, [m for m in came if not isinstance(m, ImuSample)], now_ns, near_rad)
-        if isinstance(started, str):
-            return None
-        if started.heading and heading is not None:
+        again_s = LEAST_S * (2**self._denied if told else 1)
+        if heading is None or now_ns - self._tried_ns >= duration_ns(again_s):
+            self._tried_ns = now_ns
+            why = "the motion tells the heading, which was a guess"
+            came, near_rad = tracking.told_by() if told else (tracking.since(tracking.lag.first_ns), None)
+            if not told:
+                why = "sensors measure the heading, which was a guess"
+            samples = [m for m in came if isinstance(m, ImuSample)]
+            started = self._start_from(samples, [m for m in came if not isinstance(m, ImuSample)], now_ns, near_rad)
+            if not isinstance(started, str) and not started.heading:
+                return why, started, came
+            self._denied += told
+        if told and heading is not None:
             self._persistent.heading = known  # one check alone is less than all the data that it looked at
-        return None if started.heading else (why, started, came)
+        return None
 
     def _start_over(
         self,

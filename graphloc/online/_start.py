@@ -91,10 +91,8 @@ def try_start(
 
     Args:
         datum: origin of world, None where it is to be chosen.
-        near_rad: yaw at the first sample where the motion has told it since: the only one that is tried, and no information.
+        near_rad: about the yaw at the first sample, where the motion has told it since: the only one that is tried.
     """
-    if near_rad is not None:
-        setup = setup.near(near_rad)
     config = setup.config
     span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 if len(imu) else 0.0
     if span_s < LEAST_S:
@@ -116,9 +114,7 @@ def try_start(
     if missing:
         return missing
     try:
-        return _solved(
-            setup, recording, datum, told=told, carried=config.start.heading_deg is not None and near_rad is None
-        )
+        return _solved(setup, recording, datum, told=told, near_rad=near_rad)
     except SolveError as error:
         return f"data from which the start can be solved: {error}"
 
@@ -151,18 +147,22 @@ def _missing(setup: Setup, recording: Recording, datum: Datum, *, patient: bool)
     return f"a heading: from a sensor, from `start.heading_deg`, or from {wanted_m:.0f} m of travel", False
 
 
-def _solved(setup: Setup, recording: Recording, datum: Datum, *, told: bool, carried: bool) -> Started | str:
-    """Return the start as the batch solver solves it, or what it waits for; `told`, `carried`: as in `_heading`."""
+def _solved(setup: Setup, recording: Recording, datum: Datum, *, told: bool, near_rad: float | None) -> Started | str:
+    """Return the start as the batch solver solves it, or what it waits for.
+
+    Args:
+        told: whether the motion may tell its heading. near_rad: as in `try_start`.
+    """
     config, rows = setup.config, setup.rows
     whole = origin.with_synthetic(recording, config, datum, rows)
     problem = make_problem(whole, config, datum, rows, setup.inertial, company_of(config, rows))
-    result = solve_batch(problem, newest=True)
+    result = solve_batch(problem, newest=True, near_rad=near_rad)
     span_s = _span_s(result)
     if result.noise_scale > LARGEST_NOISE_SCALE and span_s < _LONGEST_WAIT_S:
         return "data in which the IMU and the other sensors agree"
     if span_s < _CHOICE_WAIT_S and (undecided := _undecided(problem, result)):
         return undecided
-    heading = _heading(setup, recording, datum, result, told=told, carried=carried)
+    heading = _heading(setup, recording, datum, result, told=told)
     if isinstance(heading, str):
         return heading
     heights = {
@@ -217,20 +217,16 @@ def _undecided(problem: Problem, result: BatchResult) -> str:
 
 
 def _heading(
-    setup: Setup, recording: Recording, datum: Datum, result: BatchResult, *, told: bool, carried: bool
+    setup: Setup, recording: Recording, datum: Datum, result: BatchResult, *, told: bool
 ) -> UnmeasuredHeading | str | None:
-    """Return how far the heading may be off; None where sensors or the motion tell it, a text where the start waits for it.
-
-    Args:
-        told: whether the motion may tell it. carried: whether it is configured.
-    """
+    """Return how far the heading may be off; None where sensors or the motion tell it, a text where the start waits for it."""
     problem = result.problem
     last = keys.pose(len(problem.timeline) - 1)
     R = result.values.atPose3(last).rotation().matrix()
     linear_var = world_covariance(result.tree.marginalCovariance(last), R, np.zeros(3))[5, 5]
     sigma = min(float(np.sqrt(max(linear_var, result.heading_var[-1]))), ANY_HEADING_RAD)
     last_ns, drift_radps = int(problem.timeline.stamps_ns[-1]), _vertical_bias_sigma(problem.R_body_imu, result)
-    if carried and not _measured(setup, recording, datum):
+    if setup.config.start.heading_deg is not None and not _measured(setup, recording, datum):
         why = "the heading is a guess: only `start.heading_deg` told it, and the gyroscope has carried it since"
         return UnmeasuredHeading(why=why, since_ns=last_ns, sigma_rad=sigma, drift_radps=drift_radps)
     if told and not (result.headings > 1 or sigma > DOUBTFUL_RAD):

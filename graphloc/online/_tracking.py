@@ -319,8 +319,8 @@ class Tracking:
         lag = self.lag
         since_ns = min(lag.newest.stamp_ns - duration_ns(_TOLD_S), lag.first_ns)
         came = sorted((m for m in self._recent if m.stamp_ns >= since_ns), key=lambda m: m.stamp_ns)
-        while came and isinstance(came[0], ImuSample):
-            came.pop(0)
+        first = next((n for n, m in enumerate(came) if not isinstance(m, ImuSample)), len(came))
+        came = came[max(first - 1, 0) :]  # with the last sample before the first measurement
         again = {m.seq for m in self.since(lag.first_ns)}
         came = [m if m.seq in again and not isinstance(m, ImuSample) else replace(m, seq=-1) for m in came]
         R = lag.newest.pose.rotation().matrix()
@@ -339,8 +339,9 @@ class Tracking:
 
     def news(self) -> list[Event]:
         """Return what the newest state newly shows: a wrong heading, frozen receivers, position jumps, noise."""
-        check, at_ns = self._persistent.heading_check, self.lag.newest.stamp_ns
-        heading = [Event(check.said)] if check.look(self.lag, guessed=self._persistent.heading is not None) else []
+        check, at_ns, known = self._persistent.heading_check, self.lag.newest.stamp_ns, self._persistent.heading
+        guessed = known is not None and known.doubt(at_ns) != ""
+        heading = [Event(check.said)] if check.look(self.lag, guessed=guessed) else []
         heading += self._heading_news()
         was, now = self._persistent.frozen, self.lag.frozen_receivers
         self._persistent.frozen = now

@@ -9,7 +9,7 @@ course. Where headings disagree, or none is known, there are several candidates,
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
@@ -62,6 +62,13 @@ class Start:
     gyro_bias_sigma_radps: Array
     window_s: float
     notes: tuple[str, ...]
+
+    def near(self, yaw_rad: float) -> Start:
+        """Return it with one candidate of those that are only tried, where it is about known; the same where a sensor tells it."""
+        if not (self.tried and self.by_motion):
+            return self
+        note = "heading from the motion alone, one start heading tried"
+        return replace(self, yaws_rad=(float(wrap_angle(yaw_rad)),), notes=(*self.notes[:-1], note))
 
 
 def align(problem: Problem) -> Start:

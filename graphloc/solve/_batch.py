@@ -115,20 +115,26 @@ def noise_step(ratio: float) -> float:
 
 
 def solve_batch(
-    problem: Problem, progress: Progress = quiet, *, newest: bool = False, doubt_imu: bool = False
+    problem: Problem,
+    progress: Progress = quiet,
+    *,
+    newest: bool = False,
+    doubt_imu: bool = False,
+    near_rad: float | None = None,
 ) -> BatchResult:
     """Solve a whole run.
 
     Args:
         newest: `heading_var` is asked for at the last state alone.
         doubt_imu: whether to look for spans in which the IMU is wrong.
+        near_rad: yaw at the start, if the motion alone tells it: the only one that is tried.
 
     Raises:
         ImuWrong: there are some.
         SolveError: it could not be started, or the linear algebra failed.
     """
     configured = problem
-    begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu)
+    begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
     for _ in range(_MAX_SENSOR_ROUNDS):
         if not begun.start.by_motion or solved.misfit() < CONTRADICTION:
             break
@@ -138,7 +144,7 @@ def solve_batch(
             break
         problem = replace(with_sensor_noise(solved.problem, times), usual_motion=None)
         del solved  # and its graph, before the next one is made
-        begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu)
+        begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
     for _ in range(0 if newest else _MAX_JUMP_ROUNDS):
         if (jumping := with_jumps_off_track(problem, solved.settled.verdicts)) is None:
             break
@@ -146,7 +152,7 @@ def solve_batch(
         lowest = _cost(problem, solved.settled.values, begun.prior) - _CLEARLY * count
         del solved  # and its graph, before the next one is made
         try:
-            begun, solved = _first_solution(jumping, progress, newest=newest, doubt_imu=doubt_imu)
+            begun, solved = _first_solution(jumping, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
             clearly = _cost(jumping, solved.settled.values, begun.prior) < lowest
         except SolveError:
             clearly = False
@@ -253,7 +259,9 @@ class _Solved(NamedTuple):
         return _Choice(self.problem, self.settled.values, self.settled.verdicts)
 
 
-def _first_solution(problem: Problem, progress: Progress, *, newest: bool, doubt_imu: bool) -> tuple[Begun, _Solved]:
+def _first_solution(
+    problem: Problem, progress: Progress, *, newest: bool, doubt_imu: bool, near_rad: float | None
+) -> tuple[Begun, _Solved]:
     """Solve a run with the IMU's noise as it is.
 
     Where that contradicts the other sensors, the run is begun without each sensor of heading or velocity, too; else without those of
@@ -261,7 +269,7 @@ def _first_solution(problem: Problem, progress: Progress, *, newest: bool, doubt
     for most of a run may lead the heading away, where nothing leads back. Not for `newest`, as a start online has no time for it.
     """
     few = thinned(problem)
-    begun = whole = _begin(problem, few, progress, newest=newest, doubt_imu=doubt_imu)
+    begun = whole = _begin(problem, few, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
     solved = _from_there(problem, few, begun, progress)
     misfit = solved.misfit()
     doubted = [] if newest else [
@@ -315,9 +323,18 @@ def _off_for_long(off: NDArray[np.bool_]) -> bool:
     return bool(share > _OFTEN and np.count_nonzero(off[1:] != off[:-1]) < share * (1.0 - share) * len(off))
 
 
-def _begin(problem: Problem, few: Thinned, progress: Progress, *, newest: bool, doubt_imu: bool = False) -> Begun:
+def _begin(
+    problem: Problem,
+    few: Thinned,
+    progress: Progress,
+    *,
+    newest: bool,
+    doubt_imu: bool = False,
+    near_rad: float | None = None,
+) -> Begun:
     """Start a run, grow it over the thinned one, and fill in the other states."""
-    begun = solve_start(few.problem, align(problem), progress, newest=newest)
+    start = align(problem)
+    begun = solve_start(few.problem, start if near_rad is None else start.near(near_rad), progress, newest=newest)
     doubt_start = doubt_imu and begun.excess >= CONTRADICTION
     if doubt_start and (other := _begun_without_a_sensor(problem, few, begun, progress)) is not None:
         begun, doubt_start = other, False
