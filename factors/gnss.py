@@ -166,12 +166,7 @@ def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:
 def _antenna_jacobian(at: Attachment, config: GnssConfig) -> Array:
     """d(p + R (l + o) + u tau) / d(body tangent), (3, 6)."""
     R, (late, off) = at.T_world_body.rotation().matrix(), late_and_off(at, config)
-    lever = at.T_state_sensor.transformFrom(off)
-    if late:
-        lever = lever + late * at.swing_mps(off)
-    jacobian = np.empty((3, 6))
-    jacobian[:, :3], jacobian[:, 3:] = -R @ skew(lever), R
-    return jacobian
+    return np.hstack([-R @ skew(at.T_state_sensor.transformFrom(off) + late * at.swing_mps(off)), R])
 
 
 def hint(m: GnssPosition, mount_yaw_rad: float, datum: Datum) -> Hint:

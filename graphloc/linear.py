@@ -6,7 +6,6 @@ A `CustomFactor` calls back into Python at every linearisation, which costs 25 t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import cache
 from typing import Any, NamedTuple
@@ -93,10 +92,9 @@ def linear_update(
     weight = decision.weight
     if decision.kernel is not None:
         weight *= max(decision.kernel.weight(weight * residual.nis()), 1e-6)
-    # Most residuals here are of one row (headings, heights), and at every pass: numbers take a fraction of the time of arrays (1, 1).
+    # Most residuals here are of one row (headings, heights), and at every pass.
     cov, single = residual.cov, len(residual.cov) == 1
-    root = math.sqrt(weight)
-    whiten: Any = root * (1.0 / math.sqrt(cov.item())) if single else root * gauss.whitening(cov)
+    whiten = np.sqrt(weight) * (1.0 / np.sqrt(cov) if single else gauss.whitening(cov))
     points, raw = gtsam.Values() if points is None else points, residual.raw
     arguments: list[Any] = []
     for term in terms:
@@ -106,5 +104,5 @@ def linear_update(
         if term.offset is not None:
             raw = raw - term.jacobian @ term.offset
     make: Any = gtsam.JacobianFactor  # the stubs know one overload per number of states
-    linear = make(*arguments, -whiten * raw if single else -whiten @ raw, _unit(len(raw)))
+    linear = make(*arguments, -whiten @ raw, _unit(len(raw)))
     return GraphUpdate(factors=(gtsam.LinearContainerFactor(linear, points),))

@@ -167,13 +167,13 @@ def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> A
     T = values.atPose3(keys.pose(k))
     v = values.atVector(keys.velocity(k))
     bias = values.atConstantBias(keys.bias(j))
-    T_state_sensor, dv, turn = stream.mount, np.zeros(3), None
+    T_state_sensor, dv, turn = stream.mount, np.zeros(3), np.eye(3)
     carried = stream.carry[i]
     if carried is not None:
         floor, pim = carried
         there = pim.predict(nav_state(values, floor), bias)
         carried_to = T.between(there.pose())
-        T_state_sensor, turn = carried_to.compose(stream.mount), carried_to.rotation()
+        T_state_sensor, turn = carried_to.compose(stream.mount), carried_to.rotation().matrix()
         dv = np.asarray(there.velocity()) - v
     slow_key = None if stream.slow is None else keys.slow(stream.number, j)
     return Attachment(
@@ -202,13 +202,10 @@ def asks_for_delay(constants: Sequence[Constant]) -> bool:
     return any(TIME_OFFSET in constant.corrects for constant in constants)
 
 
-def _felt(problem: Sited, raw: Array, turn: Any, bias: Any) -> FeltMotion:
-    """Return what the IMU feels; `turn` (gtsam.Rot3): from the body at the measurement to that at the state, where they differ."""
-    force, spin = raw[:3] - problem.R_body_imu @ bias.accelerometer(), raw[3:]
-    if turn is not None:
-        R = turn.matrix()
-        force, spin = R @ force, R @ spin
-    return FeltMotion(force, spin, problem.links.gravity_mps2)
+def _felt(problem: Sited, raw: Array, turn: Array, bias: Any) -> FeltMotion:
+    """Return what the IMU feels; `turn` (3, 3): from the body at the measurement to that at the state."""
+    force = raw[:3] - problem.R_body_imu @ bias.accelerometer()
+    return FeltMotion(turn @ force, turn @ raw[3:], problem.links.gravity_mps2)
 
 
 def _slow_walk(problem: Sited, stream: Attaching, i: int) -> Array | None:
