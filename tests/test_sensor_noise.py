@@ -168,8 +168,8 @@ def test_online_the_kernel_of_fixes_is_found_anew_by_their_new_sigma(monkeypatch
     assert len(noted) == 1 + len(rebuilt)
 
 
-def test_fixes_that_state_a_tenth_of_their_noise_are_taken_as_they_scatter() -> None:
-    """Of a lone receiver: believed, they drew the track after their noise."""
+def lone_receiver(gnss_sigma_m: float) -> SimulatedRun:
+    """A run with fixes of this noise and a compass, and no matches."""
     scenario = replace(
         bl_scenario(1, "clean"),
         duration_s=30.0,
@@ -177,9 +177,14 @@ def test_fixes_that_state_a_tenth_of_their_noise_are_taken_as_they_scatter() -> 
         imu_hz=50.0,
         gnss_hz=5.0,
         compass_hz=1.0,
-        gnss_sigma_m=0.5,
+        gnss_sigma_m=gnss_sigma_m,
     )
-    run = stating(simulate_slowly(scenario, 3, 1.25), GnssPosition, 0.1)
+    return simulate_slowly(scenario, 3, 1.25)
+
+
+def test_fixes_that_state_a_tenth_of_their_noise_are_taken_as_they_scatter() -> None:
+    """Of a lone receiver: believed, they drew the track after their noise."""
+    run = stating(lone_receiver(0.5), GnssPosition, 0.1)
     solution = app.smooth_recording(run.recording, run.config).solution
     (said,) = (w for w in solution.stats.warnings if "scatter more than they state" in w)
     assert re.match(r"gnss: .* sigma_scale: ([0-9.]+)$", said)
@@ -240,16 +245,7 @@ def test_what_a_start_finds_is_handed_on(tmp_path: Path) -> None:
 
 def test_floors_are_raised_with_the_factor() -> None:
     """Of fixes that state a micrometre, the factor alone would have to be 300 000 to be felt; all rounds were used up, and none left for the IMU."""
-    scenario = replace(
-        bl_scenario(1, "clean"),
-        duration_s=30.0,
-        pose_hz=0.0,
-        imu_hz=50.0,
-        gnss_hz=5.0,
-        compass_hz=1.0,
-        gnss_sigma_m=0.3,
-    )
-    run = stating(simulate_slowly(scenario, 3, 1.25), GnssPosition, 1e-6 / 0.3)
+    run = stating(lone_receiver(0.3), GnssPosition, 1e-6 / 0.3)
     said = app.smooth_recording(run.recording, run.config).solution.stats.warnings
     (line,) = (w for w in said if "scatter more than they state" in w)
     found = {key: float(value) for key, value in re.findall(r"(\w+): ([0-9.]+)", line)}

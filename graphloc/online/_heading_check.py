@@ -241,8 +241,7 @@ def _mount_m(lag: Lag, receiver: str) -> Array:
 
 def _lever_m(lag: Lag, receiver: str) -> Array:
     """Return where an antenna is from the IMU (3,), m, body axes, as the window has it."""
-    mount = lag.problem.streams[receiver].mount  # from the IMU, too
-    return np.asarray(mount.translation()) + lag.antennas_off_m().get(receiver, np.zeros(3))
+    return _mount_m(lag, receiver) + lag.antennas_off_m().get(receiver, np.zeros(3))
 
 
 def _off(fit: Fit | None) -> tuple[float, float] | None:

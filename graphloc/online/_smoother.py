@@ -399,14 +399,12 @@ class OnlineSmoother:
         again_s = LEAST_S * (2**self._denied if told else 1)
         if heading is None or now_ns - self._tried_ns >= duration_ns(again_s):
             self._tried_ns = now_ns
-            why = "the motion tells the heading, which was a guess"
             came, near_rad = tracking.told_by() if told else (tracking.since(tracking.lag.first_ns), None)
-            if not told:
-                why = "sensors measure the heading, which was a guess"
             samples = [m for m in came if isinstance(m, ImuSample)]
             started = self._start_from(samples, [m for m in came if not isinstance(m, ImuSample)], now_ns, near_rad)
             if not isinstance(started, str) and not started.heading:
-                return why, started, came
+                why = "the motion tells" if told else "sensors measure"
+                return f"{why} the heading, which was a guess", started, came
             self._denied += told
         if told and heading is not None:
             self._persistent.heading = known  # one check alone is less than all the data that it looked at
