@@ -23,6 +23,7 @@ from graphloc.online import OnlineSmoother, _heading_check, _smoother, _waiting
 from graphloc.online import _start as online_start
 from graphloc.online._heading_check import Fit, HeadingCheck
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
+from graphloc.online._window import Window
 from graphloc.recording import Recording, quiet
 from graphloc.replay import arrivals
 from graphloc.solution import Cause, Health, Solution
@@ -392,6 +393,37 @@ def test_online_what_a_guess_has_bent_is_gone_once_the_motion_tells_the_heading(
     rows = Counter(row.seq for row in run.solution.ledger)
     assert set(rows.values()) == {1}
     assert len(rows) == len(recording.imu.stamps_ns) + len(recording.measurements)
+
+
+@pytest.mark.usefixtures("short_wait")
+def test_online_what_a_rebuild_has_left_out_tells_no_heading(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its row says rejected: a start with the last minute of data used it again."""
+    recording, config, *_ = robot(3, 25.0, speed_mps=8.0)
+    online, commit = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL), Window.commit
+    came, failures = list(arrivals(recording)), [0]
+
+    def broken(window: Window) -> None:
+        failures[0] += 1
+        if failures[0] <= 2:
+            raise RuntimeError("planted")
+        commit(window)
+
+    last = next(n for n, m in enumerate(came) if m.stamp_ns > came[0].stamp_ns + 20 * 10**9)
+    for m in came[:last]:
+        online.feed(m)
+    assert online._persistent.heading is not None  # noqa: SLF001 - a guess
+    with monkeypatch.context() as patch:
+        patch.setattr(Window, "commit", broken)
+        for m in came[last:]:
+            online.feed(m)
+    out = {row.seq for row in online.rows() if row.reason.startswith("left out: ")}
+    assert out
+    assert online._tracking is not None  # noqa: SLF001
+    told_ns = {m.stamp_ns for m in online._tracking.told_by()[0] if not isinstance(m, ImuSample)}  # noqa: SLF001
+    assert len(told_ns) > 10
+    assert not told_ns & {m.stamp_ns for m in recording.measurements if m.seq in out}
+    assert min(told_ns) < online._tracking.lag.first_ns  # noqa: SLF001
+    assert online._tracking.samples().stamps_ns[0] >= online._tracking.lag.first_ns  # noqa: SLF001
 
 
 @pytest.mark.usefixtures("short_wait")

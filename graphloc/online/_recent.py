@@ -64,6 +64,11 @@ class Recent:
         while len(self.anchors) > 1 and self.anchors[-1].stamp_ns >= since_ns:
             self.anchors.pop()
 
+    def forget(self, measurements: Iterable[Measurement]) -> None:
+        """Forget these measurements: they are not to be used again."""
+        out = {id(m) for m in measurements}  # their numbers may be those of others that have rows already (-1)
+        self._came = [m for m in self._came if id(m) not in out]
+
     def leave_out(self, after_ns: int) -> list[ImuSample]:
         """Take out the IMU samples since a stamp and return them."""
         out = [m for m in self._came if isinstance(m, ImuSample) and m.stamp_ns > after_ns]

@@ -260,6 +260,7 @@ class Tracking:
                 self._persistent.heading_check.note(m, self.lag)
             except Exception as error:  # noqa: BLE001 - the others are still good; nothing of this one is staged yet
                 self._ledger.drop(m, Outcome.REJECTED, f"it could not be used: {in_one_line(error)}")
+                self._recent.forget([m])
 
     def keep_anchor(self) -> bool:
         """Remember the newest state as an anchor, if that is due, and forget what no rebuild needs; tell whether it was due."""
@@ -298,8 +299,9 @@ class Tracking:
         )
 
     def samples(self) -> ImuSeries:
-        """Return the samples of the window."""
-        return series_of(self._recent.samples())
+        """Return the samples of the window; while the heading is a guess, older ones are kept."""
+        found = self._recent.samples()
+        return series_of([m for m in found if m.stamp_ns >= self.lag.first_ns] or found)
 
     def heading_measured(self) -> bool:
         """Return whether sensors have measured the heading in the window, for as long as a start takes."""
@@ -407,6 +409,7 @@ class Tracking:
             if without:
                 for m in again:
                     ledger.drop(m, Outcome.REJECTED, f"left out: {why}")
+                recent.forget(again)
                 recent.anchors = deque([anchor])
             streams, known = self.lag.problem.streams, failed.problem.streams
             jumps = [j.after_ns for name, s in streams.items() for j in s.jumps if j not in known[name].jumps]
