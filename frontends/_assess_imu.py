@@ -17,7 +17,14 @@ from graphloc.frontends import _clock
 from graphloc.frontends._assess import Courses, MeasuredMotion, vec
 from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
 from graphloc.frontends._reports import ImuReport, MountGuess
-from graphloc.frontends._sanity import HALF, NEVER_STILL_RADPS, missing_half, turns_gravity, without_gravity
+from graphloc.frontends._sanity import (
+    HALF,
+    NEVER_STILL_RADPS,
+    missing_half,
+    saturation_warning,
+    turns_gravity,
+    without_gravity,
+)
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turning import Turning, against_turning, left_of_turns
@@ -306,6 +313,7 @@ def imu_report(
     accel = accel * (STANDARD_GRAVITY_MPS2 if units.accel == "g" else 1.0)
     gyro = gyro * (np.pi / 180.0 if units.gyro == "deg/s" else 1.0)
     spiked = spike_warning(imu.topic, stamps, spikes(stamps, np.hstack([accel, gyro])))
+    cut = saturation_warning(imu.topic, accel[finite], gyro[finite])
     up = np.median(accel, axis=0)
     still = _standstill(stamps, accel, gyro, next((m for m in motions if m.rests), None))
     root_dt = float(np.sqrt(np.median(np.diff(stamps)) / NS_PER_S))
@@ -323,7 +331,7 @@ def imu_report(
         accel_unit=units.accel,
         gyro_unit=units.gyro,
         gravity=units.gravity,
-        why=(*frozen, *spiked, *([f"all its {missing} are 0: {HALF}"] if missing else []), *units.why),
+        why=(*frozen, *spiked, *cut, *([f"all its {missing} are 0: {HALF}"] if missing else []), *units.why),
         still_s=float(still.sum()) * root_dt**2,
         gyro_bias_radps=vec(gyro[still].mean(axis=0)) if quiet else None,
         accel_noise_ug=float(white_noise(accel).max()) * root_dt / ug,

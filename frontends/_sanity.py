@@ -25,6 +25,9 @@ _FEWEST = 100  # samples, that are not all 0 by chance
 _SWING_NS, _NO_SWING_RAD = 5_000_000_000, 1.5
 _STEP_S = 0.2  # at most, of a step that rates are integrated over
 _GRAVITY_S, _FEWEST_WINDOWS = 0.4, 10  # windows whose mean acceleration tells where up is
+_LEAST_RANGE_MPS2, _LEAST_RANGE_RADPS = 19.0, 1.7  # no IMU has less (2 g, 100 deg/s)
+# Readings at the end of the range that are no chance; the band beneath it (a share of it), in which fewer lie.
+_CUT, _BENEATH = 5, 0.03
 _EXPLAINED = 0.75  # of what its direction moves by, that rates in rad/s leave at most
 
 
@@ -89,7 +92,33 @@ def imu_warnings(
     fast = config.gyro_unit == "rad/s" and rate > NEVER_STILL_RADPS
     if fast and not turns_gravity(stamps_ns, accel_mps2, gyro_radps):
         lines.append(f"{sensor}: median angular rate is {rate:.2f} rad/s: looks like deg/s; set gyro_unit: deg/s")
-    return lines
+    return lines + saturation_warning(sensor, accel_mps2, gyro_radps)
+
+
+def saturation_warning(sensor: str, accel_mps2: Array, gyro_radps: Array) -> list[str]:
+    """Return a line on the axes of accelerations (N, 3) and rates (N, 3) that pile up at their largest reading: the range ends there.
+
+    What lies beyond is lost, and with it the velocity and the tilt of every knock or wave that is cut off.
+    """
+    said, cut = [], np.zeros(len(accel_mps2), dtype=bool)
+    for name, unit, values, least in (
+        ("acceleration", "m/s^2", accel_mps2, _LEAST_RANGE_MPS2),
+        ("rate", "rad/s", gyro_radps, _LEAST_RANGE_RADPS),
+    ):
+        for axis, readings in zip("xyz", values.T, strict=True):
+            for signed in (readings, -readings):
+                end = float(signed.max(initial=0.0))
+                at_end = signed >= end * (1.0 - 1e-6)
+                beneath = int(((signed > end * (1.0 - _BENEATH)) & ~at_end).sum())
+                if end >= least and max(_CUT, beneath) <= at_end.sum() < 0.5 * len(at_end):
+                    said.append(f"{name} {axis} at {'-' if signed is not readings else ''}{end:.4g} {unit}")
+                    cut |= at_end
+    if not said:
+        return []
+    return [
+        f"{sensor}: {int(cut.sum())} of {len(cut)} samples are cut off at the end of the range ({', '.join(said)}): velocity and tilt in "
+        "what they miss are wrong; set a larger range, or mount it where it shakes less"
+    ]
 
 
 def missing_half(accel: Array, gyro: Array) -> str:
