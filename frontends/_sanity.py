@@ -115,9 +115,9 @@ def saturation_warning(sensor: str, accel_mps2: Array, gyro_radps: Array) -> lis
                     cut |= at_end
     if not said:
         return []
+    which = f"{int(cut.sum())} of {len(cut)} samples are cut off at the end of the range ({', '.join(said)})"
     return [
-        f"{sensor}: {int(cut.sum())} of {len(cut)} samples are cut off at the end of the range ({', '.join(said)}): velocity and tilt in "
-        "what they miss are wrong; set a larger range, or mount it where it shakes less"
+        f"{sensor}: {which}: velocity and tilt in what they miss are wrong; set a larger range, or mount it where it shakes less"
     ]
 
 
