@@ -25,6 +25,7 @@ from graphloc.frontends.decode import UNSTAMPED
 
 # Of a velocity that is averaged over seconds: its error lasts as long, and would count as white.
 _FILTERED_SIGMA_MPS = 1.0
+_GPS_AHEAD_S = 18.0  # of UTC, since 2017
 _OWN_CLOCK_S = 10.0  # no message takes as long
 _FEWEST_STAMPS = 10  # that tell of a clock
 _STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma: a receiver's stamps; recording times instead of these
@@ -71,12 +72,10 @@ def _drift_lines(own: TopicReport) -> list[str]:
 
 def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], inspection: Inspection) -> list[str]:
     """Say what to add to the stamps: where a clock is off by the recording times, or stamps are late by the motion."""
-    clocks = {n: Clock(t.start_ns, t.latency_s[1]) for n, t in topics.items() if t.start_ns is not None and t.latency_s}
-    imu = next((clocks[i.topic] for i in inspection.imus if i.topic in clocks), None)
-    if imu is None or kind not in _SET or topic not in clocks:
+    found_behind = _behind(topic, topics, inspection) if kind in _SET else None
+    if found_behind is None:
         return []
-    own = (c for n, c in clocks.items() if not topics[n].recorded and topics[n].msgtype not in UNSTAMPED)
-    reference = reference_of(imu, own)
+    behind, clock = found_behind
     told: dict[str, Sequence[GnssReport | VelocityReport | CompassReport]] = {
         "gnss": inspection.gnss,
         "gnss_velocity": inspection.velocities,
@@ -86,10 +85,8 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
     late = found.late_s if found else None
     unstamped = topics[topic].recorded or topics[topic].msgtype in UNSTAMPED
     offset_s, why, sigma_s = 0.0, [], _ON_ITS_WAY_S if unstamped else _STAMPED_LATE_S
-    behind = behind_s(clocks[topic], imu, reference)
     if abs(behind) > EPOCH_LIMIT_S:
         offset_s, sigma_s = offset_s + behind, _ON_ITS_WAY_S
-        clock = "the IMU's" if reference is imu else "one that tells the date"
         why.append(
             f"its clock is {'behind' if behind > 0 else 'ahead of'} {clock}, by the recording times; how much longer one "
             f"message takes than the other is in it{'' if kind in _ESTIMATED else ', which no bound includes'}"
@@ -114,6 +111,33 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
         sigma_s = max(sigma_s, abs(hinted[0]) if hinted else 0.0)
         lines.append(f"  stamp_sigma_s: {sigma_s:.2f}  # guess: {_STAMPS}{said}")
     return lines
+
+
+def clock_lines(inspection: Inspection) -> list[str]:
+    """Say which sensors are stamped by a clock that is not the IMU's."""
+    topics = {t.topic.partition(" ")[0]: t for t in inspection.topics}
+    named = [imu.topic for imu in inspection.imus] + [gnss.topic for gnss in inspection.gnss]
+    named += [twist.topic for twist in inspection.velocities] + [compass.topic for compass in inspection.compasses]
+    lines = []
+    for topic in dict.fromkeys(name.partition(" ")[0] for name in named):
+        behind, clock = _behind(topic, topics, inspection) or (0.0, "")
+        if abs(behind) > EPOCH_LIMIT_S:
+            way = "behind" if behind > 0.0 else "ahead of"
+            why = ": GPS time, which is ahead of UTC by 18 s" if abs(behind + _GPS_AHEAD_S) < 0.5 else ""
+            off = f"{topic}: its clock is {abs(behind):.1f} s {way} {clock}, by the recording times"
+            lines.append(f"{off}{why}; drafted as time_offset_s")
+    return lines
+
+
+def _behind(topic: str, topics: Mapping[str, TopicReport], inspection: Inspection) -> tuple[float, str] | None:
+    """Return by how much the clock of a topic is behind another, s, by the recording times, and whose that is; None where nothing tells."""
+    clocks = {n: Clock(t.start_ns, t.latency_s[1]) for n, t in topics.items() if t.start_ns is not None and t.latency_s}
+    imu = next((clocks[i.topic] for i in inspection.imus if i.topic in clocks), None)
+    if imu is None or topic not in clocks:
+        return None
+    own = (c for n, c in clocks.items() if not topics[n].recorded and topics[n].msgtype not in UNSTAMPED)
+    reference = reference_of(imu, own)
+    return behind_s(clocks[topic], imu, reference), "the IMU's" if reference is imu else "one that tells the date"
 
 
 def scan_clock_lines(inspection: Inspection, lidars: tuple[MountedTopic, ...]) -> list[str]:

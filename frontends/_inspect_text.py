@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from graphloc.frontends._draft_clock import clock_lines
 from graphloc.frontends._reports import GnssReport, ImuReport, Inspection, OdometryReport, TopicReport
 from graphloc.plain import aligned
 from graphloc.time import utc_text
@@ -17,6 +18,7 @@ def render(inspection: Inspection) -> str:
     """Return the inspection as text for a terminal."""
     lines = [inspection.source, ""]
     lines += _topic_table(inspection.topics)
+    lines += clock_lines(inspection)
     for imu in inspection.imus:
         lines += ["", *_imu_lines(imu)]
     for gnss in inspection.gnss:

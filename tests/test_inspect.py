@@ -688,6 +688,9 @@ def test_sensors_on_other_clocks_are_judged_by_each_other(topic: str, behind_s: 
     offset_s = behind_s if topic == "/fix" else -behind_s
     gnss, imu = (config.sensors[name].time_offset_s for name in ("gnss", "imu"))
     assert gnss - imu == pytest.approx(offset_s, abs=0.1)
+    (said,) = [line for line in render(found).splitlines() if "its clock is" in line]
+    assert said.startswith(f"{topic}: its clock is {abs(behind_s)}.0 s {'ahead of' if behind_s < 0 else 'behind'} ")
+    assert ("GPS time" in said) == (behind_s == -18)
 
 
 @pytest.mark.parametrize("topic", ["/mag", "/gps/heading"])
