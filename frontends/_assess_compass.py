@@ -22,11 +22,13 @@ _FEWEST, _FEWEST_COURSES = 10, 20
 _TURNS_DEG, _SAME_DEG = 5.0, 0.2  # how much two headings must turn, and may differ by, to be one
 _DELAYS_S = np.arange(-50, 51) / 100.0  # of one heading against another that is the same
 _MOST_COMPARED = 5000  # headings of a long run
+_GAP_S, _GAP = 2.0, 3.0  # between two headings, at least, and times what is usual: none came meanwhile
 _STRAIGHT_DEG = 20.0  # courses that turn by less tell no convention
 _ASKEW_DEG = 15.0  # antennas are mounted along a vessel or athwart, to this
 _BLOCK_S = 30
 _SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
 _SIDEWAYS_DEG = 45.0  # to which scatter courses still tell by which quarter turn two antennas are mounted
+_EITHER_WAY = 0.15  # of the courses, least share either way of a vessel that goes ahead and astern
 _RELATIVE_DEG = 30.0  # off the course, from which an IMU's orientation has a north of its own
 
 
@@ -52,7 +54,8 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
     if len(stamps_ns) < _FEWEST:
         return CompassReport(**plain, **untold, usable=False, convention=default, why="its messages give no yaw")
     by_gyro = {1: "enu", -1: "ned"}.get(against_turning(turning, stamps_ns, angle))
-    heard = 0 if courses is None else int(np.searchsorted(courses.stamps_ns, stamps_ns[[0, -1]]) @ [-1, 1])
+    courses = _heard(courses, stamps_ns)
+    heard = 0 if courses is None else len(courses.stamps_ns)
     if courses is None or heard < _FEWEST_COURSES:
         why = "no GNSS course in motion to check it against" + (
             ", convention from the gyro" if by_gyro and not told else ""
@@ -99,6 +102,17 @@ def _left_out(stream: TopicData, rows: Array) -> bool:
     return float(np.median(rows[:, 12])) == -1.0 or len(np.unique(_quaternions(stream, rows), axis=0)) < 3
 
 
+def _heard(courses: Courses | None, stamps_ns: NDArray[np.int64]) -> Courses | None:
+    """Return the courses at whose times headings, at stamps (N,), came: not before, after or in a gap of them."""
+    if courses is None:
+        return None
+    after = np.searchsorted(stamps_ns, courses.stamps_ns)
+    apart_ns = np.diff(stamps_ns)
+    longest_ns = max(_GAP_S * NS_PER_S, _GAP * float(np.median(apart_ns)))
+    within = np.append(np.append(False, apart_ns <= longest_ns), False)[after]
+    return Courses(courses.stamps_ns[within], courses.course_rad[within])
+
+
 def _in_enu(angle: Array, convention: str) -> Array:
     return angle if convention == "enu" else np.pi / 2.0 - angle
 
@@ -108,12 +122,14 @@ class _Fit(NamedTuple):
 
     Attributes:
         offset_deg, scatter_deg: heading minus course: its middle, and 1 sigma about it. apart_rad: (M,) the same, of each course.
+        astern: share of the courses on which the vessel goes astern, where it goes either way; else 0.
         straight: whether the courses turn too little to tell the convention.
     """
 
     convention: str
     offset_deg: float
     scatter_deg: float
+    astern: float
     apart_rad: Array
     straight: bool
 
@@ -129,12 +145,12 @@ def _beside_courses(
     """
     measured = np.interp(courses_s, t_s, angle)
     apart = {convention: _in_enu(measured, convention) - courses.course_rad for convention in ("enu", "ned")}
-    fits = {convention: _middle_deg(off) for convention, off in apart.items()}
+    fits = {convention: _beside_either_way(off) for convention, off in apart.items()}
     turned = float(np.degrees(np.sqrt(max(0.0, -2.0 * np.log(max(abs(np.exp(1j * courses.course_rad).mean()), 1e-9))))))
     straight = turned < _STRAIGHT_DEG
 
     def unlikely(convention: str) -> tuple[float, ...]:
-        offset_deg, scatter_deg = fits[convention]
+        offset_deg, scatter_deg, _ = fits[convention]
         if not straight:
             return (scatter_deg,)
         # On a straight both conventions fit with some offset: the smaller offset is likelier, of two antennas one of quarter turns.
@@ -147,8 +163,24 @@ def _beside_courses(
     return _Fit(convention, *fits[convention], apart[convention], straight)
 
 
+def _beside_either_way(apart: Array) -> tuple[float, float, float]:
+    """Return by how much a heading is off courses (N,), rad: middle and 1 sigma, deg, and on what share of them the vessel goes astern.
+
+    One that goes ahead and astern has two middles, half a turn apart: that nearer to 0 is how the heading is mounted.
+    """
+    offset_deg, scatter_deg = _middle_deg(apart)
+    twice_deg, twice_scatter_deg = _middle_deg(2.0 * apart)
+    ahead_deg = 0.5 * twice_deg  # within 90 deg of 0
+    astern = float((np.abs(wrap_angle(apart - np.radians(ahead_deg))) > np.pi / 2.0).mean())
+    if 0.5 * twice_scatter_deg > _SCATTERS_DEG or not _EITHER_WAY < astern < 1.0 - _EITHER_WAY:
+        return offset_deg, scatter_deg, 0.0
+    return ahead_deg, 0.5 * twice_scatter_deg, astern
+
+
 def _why(fit: _Fit, by_gyro: str | None, *, told: bool, fits_course: bool, sideways: bool) -> str:
     why = f"yaw minus GNSS course: {fit.offset_deg:+.0f} deg, scatter {fit.scatter_deg:.0f} deg over {len(fit.apart_rad)} courses"
+    if fit.astern:
+        why += f", {100.0 * fit.astern:.0f} % of them astern"
     if sideways:
         return f"{why}: a vessel that often goes sideways, since it turns as the gyro does"
     if not fits_course:

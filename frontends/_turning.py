@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc.frames import Array
+from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._turns import without_line
 from graphloc.series import rms
 from graphloc.time import NS_PER_S
 
 _STEADY_S = 120.0  # within it a gyro's bias and a compass's offset are steady
+_FEWEST = 20  # angles, or changes of them, that tell anything
+# Times the span that changes are compared over: more is a gap. What an angle leaps by beside the turning, of either sense.
+_GAP, _LEAP_RAD = 1.5, 2.0
 _FOLLOWS_DEG, _FOLLOWS = 8.0, 3.0  # most RMS of what a heading and the gyroscope differ by; turns over that
 
 
@@ -41,11 +44,9 @@ def against_turning(
             must be small beside them, and the angle's noise average out. clear: correlation that is believed. as_much: factor to
             which the angle turns by as much as the craft does.
     """
-    at, own, turned = _beside(turning, at_ns, angle)
-    if len(at) < 20:
+    a, b = _changes(*_beside(turning, at_ns, angle), over_s)
+    if len(a) < _FEWEST:
         return 0
-    step = max(1, round(over_s / max(float(np.median(np.diff(at))), 1e-3)))
-    a, b = (v[step:] - v[:-step] for v in (own, turned))
     power = float(np.sqrt((a**2).sum() * (b**2).sum()))
     together = float((a * b).sum())
     if not abs(together) > clear * power:
@@ -60,11 +61,9 @@ def left_of_turns(turning: Turning, at_ns: NDArray[np.int64], angle: Array, over
     Args:
         at_ns: (N,), increasing. angle: (N,) rad, unwrapped. over_s: as for `against_turning`.
     """
-    at, own, turned = _beside(turning, at_ns, angle)
-    if len(at) < 20:
+    a, b = _changes(*_beside(turning, at_ns, angle), over_s)
+    if len(a) < _FEWEST:
         return np.inf
-    step = max(1, round(over_s / max(float(np.median(np.diff(at))), 1e-3)))
-    a, b = (v[step:] - v[:-step] for v in (own, turned))
     power = float((a**2).sum())
     return float(((a - b) ** 2).sum()) / power if power > 0.0 else np.inf
 
@@ -78,16 +77,38 @@ def follows_turning(turning: Turning | None, at_ns: NDArray[np.int64], yaw: Arra
         at_ns: (N,), increasing. yaw: (N,) rad, unwrapped, positive to port.
     """
     at, own, turned = _beside(turning, at_ns, yaw)
+    off = np.unwrap(own - turned)  # across a gap the heading itself may have turned by more than half a turn
     apart, turns = [], []
     blocks = (at - at[:1]) // _STEADY_S
     for block in (blocks == k for k in np.unique(blocks)):
-        if block.sum() >= 20:
-            apart.append(without_line((own - turned)[block], at[block]))
+        if block.sum() >= _FEWEST:
+            apart.append(without_line(off[block], at[block]))
             turns.append(without_line(turned[block], at[block]))
     if not apart:
         return False
     off_deg, turns_deg = (float(np.degrees(rms(np.concatenate(part)))) for part in (apart, turns))
     return off_deg < min(_FOLLOWS_DEG, turns_deg / _FOLLOWS)
+
+
+def _changes(at: Array, angle: Array, turned: Array, over_s: float) -> tuple[Array, Array]:
+    """Return by how much angles and a turning (N,) at times (N,), s, change within about `over_s`: (M,) of both.
+
+    Not across gaps, over which they were not unwrapped by anything that was measured, nor where an angle leaps as no turn does: a course
+    is half a turn off from where the craft goes astern.
+    """
+    if len(at) < 2:
+        return np.zeros(0), np.zeros(0)
+    usual_s = float(np.median(np.diff(at)))
+    span_s = max(over_s, usual_s)
+    after = np.searchsorted(at, at + span_s - 0.5 * usual_s)
+    first = np.flatnonzero(after < len(at))
+    after = after[first]
+    steps, turns = np.diff(angle), np.diff(turned)
+    leaps = np.minimum(np.abs(wrap_angle(steps - turns)), np.abs(wrap_angle(steps + turns))) > _LEAP_RAD
+    leapt = np.cumsum(np.append(0, leaps))
+    whole = (at[after] - at[first] < _GAP * span_s) & (leapt[after] == leapt[first])
+    first, after = first[whole], after[whole]
+    return angle[after] - angle[first], turned[after] - turned[first]
 
 
 def _beside(turning: Turning | None, at_ns: NDArray[np.int64], angle: Array) -> tuple[Array, Array, Array]:
