@@ -30,6 +30,7 @@ from graphloc.config import (
 from graphloc.extras import added
 from graphloc.frames import Array, Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.frontends import nmea
+from graphloc.frontends._fixes import RTK_SIGMA_M
 from graphloc.frontends._rejections import Rejection, ignored, malformed, rejected
 from graphloc.frontends.vendors import (
     STAMPS,
@@ -288,12 +289,12 @@ def _placed(
         cov = cov.copy()
         cov[2, :] = cov[:, 2] = 0.0  # what the message claims of a height that it does not give
         default[2] = NO_HEIGHT_M2
+    stated = usable_covariance(cov, default)
+    sigma_m = float(np.sqrt(np.diag(stated)[:2].max()))
+    if config.fixes != "any" and (sigma_m < RTK_SIGMA_M) != (config.fixes == "rtk"):
+        return ignored(f"it states {sigma_m:.2g} m, and fixes is {config.fixes}")
     return GnssPosition(
-        stamp_ns=stamp_ns,
-        sensor=sensor,
-        seq=seq,
-        position=Geodetic(lat, lon, height),
-        cov_enu_m2=usable_covariance(cov, default),
+        stamp_ns=stamp_ns, sensor=sensor, seq=seq, position=Geodetic(lat, lon, height), cov_enu_m2=stated
     )
 
 

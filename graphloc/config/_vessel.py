@@ -67,9 +67,11 @@ class OutputConfig(Block):
 def _read_alike(a: Any, b: Any) -> bool:
     """Whether two sensors of a kind and topic read the same messages, or a sentence in common (`GGA` is that of any talker, also `GPGGA`).
 
-    Of a velocity, one may read what is over ground, the other what is through the water.
+    Of a velocity, one may read what is over ground, the other what is through the water; of a receiver, one its RTK, the other the rest.
     """
     if getattr(a, "through", "") != getattr(b, "through", ""):
+        return False
+    if {getattr(a, "fixes", "any"), getattr(b, "fixes", "any")} == {"rtk", "other"}:
         return False
     pairs = list(product(getattr(a, "nmea", ()), getattr(b, "nmea", ())))
     return not pairs or any(one.endswith(other) or other.endswith(one) for one, other in pairs)
