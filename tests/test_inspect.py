@@ -66,13 +66,13 @@ def drive(
     )
     gyro = np.column_stack([0 * t, 0 * t, rate]) + rng.normal(0, 1e-3, (len(t), 3)) + [0.0, 0.0, 0.004]
     lla = DATUM.geodetic_from_enu(np.column_stack([east, north, 0 * t]) + noise_m * rng.normal(size=(len(t), 3)))
+    in_sensor = (accel_scale * (accel @ R)).tolist(), (gyro_scale * (gyro @ R)).tolist()
+    cov = (sigma_m**2 * np.eye(3)).ravel()
     items: list[Item] = []
-    for k in range(len(t)):
+    for k, felt in enumerate(zip(*in_sensor, strict=True)):
         stamp = START_NS + k * S // 50
-        in_sensor = accel_scale * (R.T @ accel[k]), gyro_scale * (R.T @ gyro[k])
-        items.append(("/imu", stamp, make.imu(stamp, *in_sensor, frame="imu_link")))
+        items.append(("/imu", stamp, make.imu(stamp, *felt, frame="imu_link")))
         if k % 10 == 0:
-            cov = (sigma_m**2 * np.eye(3)).ravel()
             items.append(("/fix", stamp, make.fix(stamp, lla[k][0], lla[k][1], lla[k][2], status, cov)))
             heading = np.pi / 2.0 - yaw[k]
             half = 0.5 * (heading + np.radians(1.0) * rng.normal())
