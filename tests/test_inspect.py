@@ -420,6 +420,21 @@ def test_axes_of_a_velocity(axes: str, said: str, enabled: bool, tmp_path: Path)
         np.testing.assert_allclose(read, v)
 
 
+def test_the_arrays_of_a_stream_are_made_once_and_anew_after_a_message() -> None:
+    stream = TopicData("/vel", TWIST)
+    for k in (0, 1, 2):  # without a stamp, the first one is dropped
+        stream.add(k * S, k * S + 1, (float(k), 1e13, 0.0), "run")
+        assert (len(stream.rows), len(stream.stamps_ns), len(stream.logs_ns)) == (k + 1, k + 1, k + 1)
+    stream.settle()
+    assert stream.rows is stream.later(S).rows
+    np.testing.assert_array_equal(stream.rows, [(1.0, np.nan, 0.0), (2.0, np.nan, 0.0)])
+    assert stream.stamps_ns.tolist() == [S, 2 * S]
+    assert stream.logs_ns.tolist() == [S + 1, 2 * S + 1]
+    assert stream.later(S).stamps_ns.tolist() == [2 * S, 3 * S]
+    assert stream.stamped(stream.stamps_ns + 5).stamps_ns.tolist() == [S + 5, 2 * S + 5]
+    assert stream.logged(stream.logs_ns + 5).logs_ns.tolist() == [S + 6, 2 * S + 6]
+
+
 @pytest.mark.parametrize(("scatter_m", "axes"), [(0.8, "east, north, up"), (6.0, None)])
 def test_a_velocity_is_judged_without_the_noise_of_the_fixes(scatter_m: float, axes: str | None) -> None:
     """1.5 m/s told exactly, beside fixes once a second: places 0.8 m off make chords of 2 s 0.8 m/s wrong, the velocity not."""
