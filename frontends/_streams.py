@@ -180,6 +180,8 @@ _MOST = 1e12
 class TopicData:
     """Columns of one topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`).
 
+    Arrays are made once, and cannot be written to.
+
     recorded: whether the stamps are recording times, because the headers hold none, or whole seconds only.
     part: what it is of a maker's message; None of other messages. filtered: how many of these a filter made, by what they say.
     drift_ppm: by how much the clock ran fast; what it gained is taken off the stamps. elapsed: (N,) ns from the beginning of the bag.
@@ -199,14 +201,25 @@ class TopicData:
     tuples: list[tuple[float, ...]] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
     elapsed: list[int] = field(default_factory=list)
+    _rows: Array | None = field(default=None, compare=False)  # as below, of `tuples`, which copies share
+    _made: dict[str, NDArray[np.int64]] = field(
+        default_factory=dict, init=False, compare=False
+    )  # of the lists, once each
 
     def add(self, stamp_ns: int, log_ns: int, row: tuple[float, ...], file: str, elapsed_ns: int = 0) -> None:
         """Append a message."""
+        if self._made or self._rows is not None:
+            self._anew()
         self.files.append(file)
         self.elapsed.append(elapsed_ns)
         self._stamps.append(stamp_ns)
         self._logs.append(log_ns)
         self.tuples.append(row)
+
+    def _anew(self) -> None:
+        """Forget the arrays that were made of the lists."""
+        self._rows = None
+        self._made.clear()
 
     @classmethod
     def joined(cls, topic: str, parts: Sequence[TopicData]) -> TopicData:
@@ -226,6 +239,7 @@ class TopicData:
         stamps = self.stamps_ns
         if len(stamps) > 1 and (bool((stamps == stamps[0]).all()) or self._in_whole_seconds()):
             self.recorded, self._stamps = True, list(self._logs)
+            self._anew()
             return
         there = (stamps != 0).tolist()
         self.no_stamp = there.count(False)
@@ -234,6 +248,7 @@ class TopicData:
         columns: tuple[list[Any], ...] = (self._stamps, self._logs, self.tuples, self.files, self.elapsed)
         for column in columns:
             column[:] = list(compress(column, there))
+        self._anew()
 
     def _in_whole_seconds(self) -> bool:
         """Whether several measurements a second are stamped in whole seconds, and are recorded one after another.
@@ -265,19 +280,27 @@ class TopicData:
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
         """Header stamps in order of arrival."""
-        return np.array(self._stamps, dtype=np.int64)
+        return self._array("stamps", self._stamps)
 
     @property
     def logs_ns(self) -> NDArray[np.int64]:
         """Recording times in order of arrival."""
-        return np.array(self._logs, dtype=np.int64)
+        return self._array("logs", self._logs)
+
+    def _array(self, name: str, column: list[int]) -> NDArray[np.int64]:
+        if name not in self._made:
+            self._made[name] = np.array(column, dtype=np.int64)
+            self._made[name].flags.writeable = False
+        return self._made[name]
 
     @property
     def rows(self) -> Array:
         """Values (N, k); NaN for values too large to be measurements, whose squares would overflow."""
-        rows = np.array(self.tuples, dtype=float)
-        rows[np.abs(rows) > _MOST] = np.nan
-        return rows
+        if self._rows is None:
+            self._rows = np.array(self.tuples, dtype=float)
+            self._rows[np.abs(self._rows) > _MOST] = np.nan
+            self._rows.flags.writeable = False
+        return self._rows
 
     def __len__(self) -> int:
         return len(self._stamps)

@@ -66,13 +66,13 @@ def drive(
     )
     gyro = np.column_stack([0 * t, 0 * t, rate]) + rng.normal(0, 1e-3, (len(t), 3)) + [0.0, 0.0, 0.004]
     lla = DATUM.geodetic_from_enu(np.column_stack([east, north, 0 * t]) + noise_m * rng.normal(size=(len(t), 3)))
+    in_sensor = (accel_scale * (accel @ R)).tolist(), (gyro_scale * (gyro @ R)).tolist()
+    cov = (sigma_m**2 * np.eye(3)).ravel()
     items: list[Item] = []
-    for k in range(len(t)):
+    for k, felt in enumerate(zip(*in_sensor, strict=True)):
         stamp = START_NS + k * S // 50
-        in_sensor = accel_scale * (R.T @ accel[k]), gyro_scale * (R.T @ gyro[k])
-        items.append(("/imu", stamp, make.imu(stamp, *in_sensor, frame="imu_link")))
+        items.append(("/imu", stamp, make.imu(stamp, *felt, frame="imu_link")))
         if k % 10 == 0:
-            cov = (sigma_m**2 * np.eye(3)).ravel()
             items.append(("/fix", stamp, make.fix(stamp, lla[k][0], lla[k][1], lla[k][2], status, cov)))
             heading = np.pi / 2.0 - yaw[k]
             half = 0.5 * (heading + np.radians(1.0) * rng.normal())
@@ -418,6 +418,21 @@ def test_axes_of_a_velocity(axes: str, said: str, enabled: bool, tmp_path: Path)
         recording = read_recording(tmp_path / "run", config)
         read = [m.v_world_mps for m in recording.of(GnssVelocity)]
         np.testing.assert_allclose(read, v)
+
+
+def test_the_arrays_of_a_stream_are_made_once_and_anew_after_a_message() -> None:
+    stream = TopicData("/vel", TWIST)
+    for k in (0, 1, 2):  # without a stamp, the first one is dropped
+        stream.add(k * S, k * S + 1, (float(k), 1e13, 0.0), "run")
+        assert (len(stream.rows), len(stream.stamps_ns), len(stream.logs_ns)) == (k + 1, k + 1, k + 1)
+    stream.settle()
+    assert stream.rows is stream.later(S).rows
+    np.testing.assert_array_equal(stream.rows, [(1.0, np.nan, 0.0), (2.0, np.nan, 0.0)])
+    assert stream.stamps_ns.tolist() == [S, 2 * S]
+    assert stream.logs_ns.tolist() == [S + 1, 2 * S + 1]
+    assert stream.later(S).stamps_ns.tolist() == [2 * S, 3 * S]
+    assert stream.stamped(stream.stamps_ns + 5).stamps_ns.tolist() == [S + 5, 2 * S + 5]
+    assert stream.logged(stream.logs_ns + 5).logs_ns.tolist() == [S + 6, 2 * S + 6]
 
 
 @pytest.mark.parametrize(("scatter_m", "axes"), [(0.8, "east, north, up"), (6.0, None)])

@@ -159,7 +159,9 @@ class AerialImage:
         scale = np.array(has.shape[::-1]) / (high - low)
         if (finer * scale).max() > 1.5:  # the grid is coarser than what was read: average, do not pick
             image = cv2.GaussianBlur(image, (0, 0), sigmaX=0.4 * finer[0] * scale[0], sigmaY=0.4 * finer[1] * scale[1])
-        at = (uv * scale[:, None, None] + ((0.5 - low) * scale - 0.5)[:, None, None]).astype(np.float32)
+        uv *= scale[:, None, None]  # in place: memory for more of these takes longer to get than to fill
+        uv += ((0.5 - low) * scale - 0.5)[:, None, None]
+        at = uv.astype(np.float32)
         pixels = cv2.remap(image, at[0], at[1], cv2.INTER_LINEAR)
         covered = cv2.remap(has, at[0], at[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
         if not covered.any():

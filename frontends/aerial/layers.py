@@ -68,7 +68,8 @@ def weighed(patch: Patch, sources: Sequence[tuple[Layer, Layer | None, Weights]]
     def over(parts: Sequence[tuple[Layer, float]]) -> Pixels:
         most = np.zeros(parts[0][0].shape, dtype=np.uint8)
         for layer, weight in parts:
-            np.maximum(most, np.rint(layer * np.float32(weight / unit)).astype(np.uint8), out=most)
+            for values, so_far in zip(layer, most, strict=True):  # one by one they stay in the processor's cache
+                np.maximum(so_far, np.rint(values * np.float32(weight / unit)).astype(np.uint8), out=so_far)
         return most
 
     shores = [(shore, w.shore) for _, shore, w in sources if shore is not None]

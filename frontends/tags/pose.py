@@ -7,6 +7,7 @@ several tags together mostly have one. Each is refined to the minimum of the whi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array
+from graphloc.frontends.tags._decode import compiled
 from graphloc.frontends.tags._spread import spread
 from graphloc.measurements import TagMode
 
@@ -113,62 +115,139 @@ def _mirrored(R: Array, t: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(2.0 * tilt * axis / length).as_matrix() @ R)
 
 
-def _errors(arms_m: Array, rays: Array, R: Array, middle_m: Array) -> Array | None:
-    """Return the errors (8 K,) of points at arms `arms_m` (4 K, 3, in world) from a middle (3,) in camera; None if behind it."""
-    there = arms_m @ R.T + middle_m
-    z = there[:, 2:]
-    return None if z.min() < _NEAREST_M else (there[:, :2] / z - rays).ravel()
+@compiled
+def _descended(arms_m, rays, whiten, R, there):  # type: ignore[no-untyped-def]
+    """Levenberg-Marquardt: move R (3, 3) and the middle in camera, there (3,), to a minimum, in place.
 
+    The error of a point is that of its ray. With its arm from the middle, (x, y, z) in camera, and its ray (u, v) at some depth, a shift
+    and a rotation about the middle change it by d u = (1, 0, -u) / depth (shift + turn x arm), and so for v.
 
-def _jacobian(arms_m: Array, R: Array, middle_m: Array) -> Array:
-    """Return the derivative (8 K, 6) of these errors by a shift and a rotation about the points' middle, in camera.
+    Loops are written out, as numba takes seconds to compile what numpy would do for them.
 
-    With the arm a in camera, and the ray u, v at depth z: d u = (1, 0, -u) / z (shift + turn x a), and so for v.
+    Args:
+        arms_m: (4 K, 3) from the middle, in world. rays: (4 K, 2). whiten: (8 K, 8 K).
+
+    Returns:
+        The squared error there, negative where points are behind the camera to begin with; the information (6, 6).
     """
-    x, y, z = arms = R @ arms_m.T
-    u, v, depth = arms + middle_m[:, None]
-    u, v = u / depth, v / depth
-    J = np.zeros((len(arms_m), 2, 6))
-    J[:, 0, 0] = J[:, 1, 1] = 1.0
-    J[:, 0, 2], J[:, 1, 2] = -u, -v
-    J[:, 0, 3], J[:, 0, 4], J[:, 0, 5] = -u * y, z + u * x, -y
-    J[:, 1, 3], J[:, 1, 4], J[:, 1, 5] = -z - v * y, v * x, x
-    J /= depth[:, None, None]
-    return J.reshape(-1, 6)
+    size = len(whiten)
+    raw, r, J, A = np.empty((size, 7)), np.empty(size), np.empty((size, 7)), np.empty((6, 6))
+    L, step, turn = np.empty((6, 6)), np.zeros(6), np.zeros((3, 3))
+    R_new, there_new = R.copy(), there.copy()
+    squared, damping, settled = np.inf, 1e-3, False
+    for round_ in range(_ROUNDS + 1):
+        # Errors at the new pose, in the last column, and their derivatives.
+        ahead = True
+        for n in range(len(arms_m)):
+            x, y, z = 0.0, 0.0, 0.0
+            for k in range(3):
+                x += R_new[0, k] * arms_m[n, k]
+                y += R_new[1, k] * arms_m[n, k]
+                z += R_new[2, k] * arms_m[n, k]
+            depth = z + there_new[2]
+            ahead = ahead and not depth < _NEAREST_M
+            u, v = (x + there_new[0]) / depth, (y + there_new[1]) / depth
+            i, j = 2 * n, 2 * n + 1
+            raw[i, 0], raw[i, 1], raw[i, 2] = 1.0 / depth, 0.0, -u / depth
+            raw[j, 0], raw[j, 1], raw[j, 2] = 0.0, 1.0 / depth, -v / depth
+            raw[i, 3], raw[i, 4], raw[i, 5], raw[i, 6] = -u * y / depth, (z + u * x) / depth, -y / depth, u - rays[n, 0]
+            raw[j, 3], raw[j, 4], raw[j, 5], raw[j, 6] = (-z - v * y) / depth, v * x / depth, x / depth, v - rays[n, 1]
+        if not ahead and round_ == 0:
+            return -1.0, A
+        after = 0.0
+        for i in range(size):
+            r[i] = 0.0
+            for k in range(size):
+                r[i] += whiten[i, k] * raw[k, 6]
+            after += r[i] * r[i]
+        if round_ == 0 or (ahead and after <= squared):
+            for i in range(size):
+                for k in range(6):
+                    J[i, k] = 0.0
+                for m in range(size):
+                    for k in range(6):
+                        J[i, k] += whiten[i, m] * raw[m, k]
+                J[i, 6] = r[i]
+            for i in range(6):
+                for k in range(6):
+                    A[i, k] = 0.0
+                    for m in range(size):
+                        A[i, k] += J[m, i] * J[m, k]
+            for i in range(3):
+                there[i] = there_new[i]
+                for k in range(3):
+                    R[i, k] = R_new[i, k]
+            squared = after
+            if round_ > 0:
+                damping = max(damping / 5.0, 1e-12)
+                settled = True
+                for k in range(6):
+                    settled = settled and abs(step[k]) < _SETTLED
+        else:
+            damping *= 8.0
+        if settled or round_ == _ROUNDS or damping > 1e9:
+            break
+        # Damped step by Cholesky; not numbers, which are no progress, where A is not positive.
+        for i in range(6):
+            for j in range(i + 1):
+                value = A[i, j] + (damping * A[i, j] + 1e-9 if i == j else 0.0)
+                for k in range(j):
+                    value -= L[i, k] * L[j, k]
+                L[i, j] = math.sqrt(value) if i == j else value / L[j, j]
+        for i in range(6):
+            value = 0.0
+            for m in range(size):
+                value -= J[m, i] * J[m, 6]
+            for k in range(i):
+                value -= L[i, k] * step[k]
+            step[i] = value / L[i, i]
+        for i in range(5, -1, -1):
+            value = step[i]
+            for k in range(i + 1, 6):
+                value -= L[k, i] * step[k]
+            step[i] = value / L[i, i]
+        # Its rotation, by Rodrigues' formula.
+        a, b, c = step[3], step[4], step[5]
+        angle = math.sqrt(a * a + b * b + c * c)
+        sine = math.sin(angle) / angle if angle > 0.0 else 1.0
+        rest = (1.0 - math.cos(angle)) / (angle * angle) if angle > 0.0 else 0.5
+        turn[0, 0], turn[0, 1], turn[0, 2] = (
+            1.0 - rest * (b * b + c * c),
+            rest * a * b - sine * c,
+            rest * a * c + sine * b,
+        )
+        turn[1, 0], turn[1, 1], turn[1, 2] = (
+            rest * a * b + sine * c,
+            1.0 - rest * (a * a + c * c),
+            rest * b * c - sine * a,
+        )
+        turn[2, 0], turn[2, 1], turn[2, 2] = (
+            rest * a * c - sine * b,
+            rest * b * c + sine * a,
+            1.0 - rest * (a * a + b * b),
+        )
+        for i in range(3):
+            there_new[i] = there[i] + step[i]
+            for k in range(3):
+                R_new[i, k] = turn[i, 0] * R[0, k] + turn[i, 1] * R[1, k] + turn[i, 2] * R[2, k]
+    return squared, A
 
 
 def _misfit(points_m: Array, rays: Array, whiten: Array, R: Array, t: Array) -> float:
-    r = _errors(points_m, rays, R, t)
-    return np.inf if r is None else float(np.linalg.norm(whiten @ r))
+    there = points_m @ R.T + t
+    z = there[:, 2:]
+    return np.inf if z.min() < _NEAREST_M else float(np.linalg.norm(whiten @ (there[:, :2] / z - rays).ravel()))
 
 
 def _refine(points_m: Array, rays: Array, whiten: Array, R: Array, t: Array) -> PoseOfCamera | None:
-    """Levenberg-Marquardt from an initial pose."""
+    """Return the minimum that an initial pose leads to; None if it is behind the points, or leads nowhere."""
     middle = points_m.mean(axis=0)
-    arms, there = points_m - middle, R @ middle + t
-    now = _errors(arms, rays, R, there)
-    if now is None:
+    R, there = np.array(R, dtype=float, order="C"), R @ middle + t
+    # Copies, which may be written to: the loops are compiled for these alone.
+    squared, information = _descended(points_m - middle, np.array(rays, dtype=float, order="C"), whiten, R, there)
+    if squared < 0.0 or there[2] > _FARTHEST * float(np.linalg.norm(points_m[1] - points_m[0])):
         return None
-    r, J, damping = whiten @ now, whiten @ _jacobian(arms, R, there), 1e-3
-    for _ in range(_ROUNDS):
-        A = J.T @ J
-        A.flat[::7] += damping * A.flat[::7] + 1e-9
-        step = np.linalg.solve(A, -J.T @ r)
-        R_new, there_new = cv2.Rodrigues(step[3:])[0] @ R, there + step[:3]
-        after = _errors(arms, rays, R_new, there_new)
-        whitened = None if after is None else whiten @ after
-        if whitened is not None and float(whitened @ whitened) <= float(r @ r):
-            R, there, r, J = R_new, there_new, whitened, whiten @ _jacobian(arms, R_new, there_new)
-            damping = max(damping / 5.0, 1e-12)
-            if np.abs(step).max() < _SETTLED:
-                break
-        else:
-            damping *= 8.0
-            if damping > 1e9:
-                break
-    if there[2] > _FARTHEST * float(np.linalg.norm(points_m[1] - points_m[0])):
-        return None
-    return PoseOfCamera(R, there - R @ middle, float(r @ r), J.T @ J)
+    return PoseOfCamera(R, there - R @ middle, squared, information)
 
 
 def _same(one: PoseOfCamera, other: PoseOfCamera, points_m: Array) -> bool:
