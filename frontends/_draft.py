@@ -43,6 +43,9 @@ _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _ANTENNA_OFF_M = 1.0  # from the IMU: of a car; 4 m on a boat or 0.3 m on a robot are found with it as well
 _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off: else a wrong fix draws the track along
+_FLOAT_S = (
+    60.0  # for how long the error of a float or single fix stays the same: anchored by RTK, its growth is the bound
+)
 _FILTERED = "by its name, or its messages, a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
 _MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; drivers may publish each packet
 _TURN_S = 0.1
@@ -73,6 +76,8 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         yield _imu_block(_numbered("imu", k), imu, enabled=k == 0 and not imu.missing)
     for k, gnss in enumerate(inspection.gnss):
         yield _gnss_block(_numbered("gnss", k), gnss, enabled=k == 0)
+        if gnss.by_turns:
+            yield _other_block(_numbered("gnss", k), gnss, enabled=k == 0)
     for k, item in enumerate(_in_a_grid(inspection)):
         yield _grid_block(_numbered("gnss", k), item, enabled=k == 0)
     compasses = sorted(
@@ -278,8 +283,26 @@ def _noise_lines(imu: ImuReport) -> list[str]:
     return lines
 
 
+def _other_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
+    """The fixes of a receiver while its RTK is gone: as a second sensor, with an error of metres that the RTK does not have."""
+    default = SlowErrorConfig()
+    slow_m = min(gnss.sigma_p95_m, default.horizontal_sigma_m)
+    keys = f"horizontal_sigma_m: {slow_m:.2g}, vertical_sigma_m: {2.0 * slow_m:.2g}, time_constant_s: {_FLOAT_S:g}"
+    return [
+        f"{name}_other:",
+        "  kind: gnss",
+        "  fixes: other  # those without RTK: a sensor of its own, whose error is slow",
+        *_topic_lines(gnss.topic),
+        *([] if enabled else [f"  enabled: false  # guess: as {name}"]),
+        *_antenna_lines(gnss.tf_frame, "from tf"),
+        f"  slow_error: {{{keys}}}  # guess: as large as they claim, and other from minute to minute",
+    ]
+
+
 def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     lines = [f"{name}:", "  kind: gnss", *_topic_lines(gnss.topic)]
+    if gnss.by_turns:
+        lines.append(f"  fixes: rtk  # guess: {100.0 * gnss.rtk_share:.0f} % of the fixes; the rest is {name}_other's")
     if not enabled:
         why = (
             _FILTERED
@@ -293,11 +316,12 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     lines += _scatter_lines(gnss)
     lines += _rtk_lines(gnss)
     lines += _uneven_lines(gnss)
-    wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error
+    wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error and not gnss.by_turns
     if wanders:
         lines.append(f"  min_vertical_sigma_m: 5.0  # guess: height ranges over {gnss.height_range_m:.0f} m")
-    if not gnss.slow_error:
-        lines.append(_rtk_slow_error(gnss))
+    if gnss.by_turns or not gnss.slow_error:
+        why = f"status gbas (RTK) and less than {RTK_SIGMA_M:g} m" if gnss.by_turns else gnss.why
+        lines.append(f"  slow_error: {{{_RTK_SLOW_ERROR}}}  # guess: {why}")
     else:
         # Left to the default, which is on where a second absolute sensor can tell the error from motion.
         large, said = _slow_error(gnss)
@@ -351,18 +375,6 @@ def _scatter_lines(gnss: GnssReport) -> list[str]:
         return [f"  sigma_scale: {times:.1f}  # {scatter}, and claim {claimed:.2f} m"]
     vertical = f"  default_vertical_sigma_m: {times * default.default_vertical_sigma_m:.1f}  # guess: as many times"
     return [f"  default_horizontal_sigma_m: {gnss.white_m:.1f}  # {scatter}, and claim nothing", vertical]
-
-
-def _rtk_slow_error(gnss: GnssReport) -> str:
-    """That of RTK; where a part of the fixes is float, as large as those claim to be off: the error of a float is slow."""
-    # A single fix claims more for its white noise.
-    floats_m = min(gnss.sigma_p95_m, SlowErrorConfig().horizontal_sigma_m)
-    if floats_m < RTK_SIGMA_M:
-        return f"  slow_error: {{{_RTK_SLOW_ERROR}}}  # guess: {gnss.why}"
-    said = f"{gnss.why}, but 5 % are good to {gnss.sigma_p95_m:.2g} m or worse (float?), and such an error is slow"
-    return (
-        f"  slow_error: {{horizontal_sigma_m: {floats_m:.2g}, vertical_sigma_m: {2.0 * floats_m:.2g}}}  # guess: {said}"
-    )
 
 
 def _rtk_lines(gnss: GnssReport) -> list[str]:

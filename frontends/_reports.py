@@ -23,6 +23,7 @@ _DIFFERS = 1.5  # times the default of a slow error
 # Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
 _RTK_M = (0.05, 0.1)
 _RTK_SCATTER_M = 0.1
+_BY_TURNS = 0.05  # share of the fixes, of RTK and of others
 WATER = " (through water)"
 """At the end of the name of a stream of those of a Doppler log's messages that say so."""
 FILTER = " (of a filter)"
@@ -138,6 +139,7 @@ class GnssReport:
         wander: by how much their error changes along the way, by `wander_by`, wheels or a velocity; empty where these do not tell.
         uneven: how unevenly its fixes are stamped; None where these tell when each was measured.
         apart_m: by how much it and `apart_from`, the receiver it agrees with best, wander against each other, 1 sigma of an axis.
+        rtk_share: share of the fixes that are of fixed RTK, by their status and what they state.
         without_height: fixes without one. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
 
@@ -153,6 +155,7 @@ class GnssReport:
     first: Vec
     slow_error: bool
     why: str
+    rtk_share: float = 0.0
     sigma_p95_m: float = 0.0
     tf_frame: str | None = None
     white_m: float | None = None
@@ -177,6 +180,11 @@ class GnssReport:
             return None
         seen_m = max(self.scatter_m[:2]), self.scatter_m[2]
         return None if seen_m[0] > _RTK_SCATTER_M else (max(_RTK_M[0], seen_m[0]), max(_RTK_M[1], seen_m[1]))
+
+    @property
+    def by_turns(self) -> bool:
+        """Whether its RTK comes and goes: two sensors, each with a slow error of its own."""
+        return _BY_TURNS <= self.rtk_share <= 1.0 - _BY_TURNS
 
     @property
     def differs(self) -> bool:

@@ -158,6 +158,14 @@ class VesselConfig(Block):
         """Return the configuration of a run that starts with this heading, deg; None: with none that is configured."""
         return self.model_copy(update={"start": self.start.model_copy(update={"heading_deg": heading_deg})})
 
+    def by_turns(self, name: str) -> list[str]:
+        """Return the names of the enabled sensors that read one receiver's fixes by turns (`fixes`), this one among them."""
+        own = self.sensors[name]
+        if getattr(own, "fixes", "any") == "any":
+            return [name]
+        read = {n: s for n, s in self.of_kind(own.kind).items() if s.topic == own.topic and s.fixes != "any"}
+        return [name, *(n for n in read if n != name)]
+
     def of_kind(self, kind: str) -> dict[str, Any]:
         """Return the enabled sensors of a kind, by name."""
         return {n: s for n, s in self.sensors.items() if s.kind == kind and s.enabled}

@@ -21,7 +21,7 @@ from graphloc.solve._covariances import (
     widen_heading,
     world_covariance,
 )
-from graphloc.solve._health import health_of
+from graphloc.solve._health import health_of, of_receivers
 
 
 def estimate_of(
@@ -63,7 +63,7 @@ def estimate_of(
     widen_heading(cov, heading_var)
     limit_heading(cov)
     since = {n: max((at_ns - agreed_ns[n]) * 1e-9, 0.0) if n in agreed_ns else np.inf for n in absolute}
-    health, reason = health_of(cov, since, doubt)
+    health, reason = health_of(cov, of_receivers(since, problem.config), doubt)
     if doubt and reason.text != doubt:
         reason = replace(reason, text=f"{reason}; {doubt}")
     if guess:

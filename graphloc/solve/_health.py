@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import reduce
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build import Problem, Stream
+from graphloc.config import VesselConfig
 from graphloc.frames import Array
 from graphloc.position_jumps import LASTS_S, why_in_doubt
 from graphloc.solution import Cause, Health, HealthReason, SolveStats
@@ -72,6 +75,14 @@ def since_agreed(problem: Problem, stream: Stream, verdicts: dict[tuple[int, int
         return np.full(len(stamps), np.inf)
     left = np.searchsorted(agreed, stamps, side="right") - 1
     return np.where(left >= 0, (stamps - agreed[np.maximum(left, 0)]) * 1e-9, np.inf)
+
+
+def of_receivers(since: Mapping[str, Any], config: VesselConfig) -> dict[str, Any]:
+    """Return how long each absolute sensor has not agreed, s, by sensor, numbers or arrays: as one those that read one receiver by turns."""
+    alike = {name: config.by_turns(name) for name in since}
+    return {
+        name: reduce(np.minimum, (since[other] for other in others if other in since)) for name, others in alike.items()
+    }
 
 
 def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:

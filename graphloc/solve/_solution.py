@@ -29,7 +29,7 @@ from graphloc.solve._covariances import (
 )
 from graphloc.solve._doubt import widen_by_doubt
 from graphloc.solve._drift import with_drift_taken_back
-from graphloc.solve._health import health_over_time, late_of, misfits, since_agreed
+from graphloc.solve._health import health_over_time, late_of, misfits, of_receivers, since_agreed
 from graphloc.solve._imu_mount import mount_error
 from graphloc.solve._ledger import ledger_of
 from graphloc.solve._unmodelled import unmodelled
@@ -76,7 +76,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     since = {s.name: since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     stats = stats_of(problem, result)
     stats = replace(stats, warnings=(*stats.warnings, *unsaid), events=mount_event(result.problem))
-    health, reasons = health_over_time(trajectory, since, misfits(problem, result, stats))
+    health, reasons = health_over_time(trajectory, of_receivers(since, problem.config), misfits(problem, result, stats))
     ledger = ledger_of(problem, recording, result.verdicts)
     corrected = {s.name: corrections(solved_constants(s, result.values), s.mount) for s in problem.streams}
     return Solution(
