@@ -234,8 +234,8 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
     sigmas = np.where(
         known, np.sqrt(np.where(known, rows[:, 5:7].max(axis=1), 0.0)), GnssConfig().default_horizontal_sigma_m
     )
-    worst_m = float(np.percentile(sigmas, 95)) if known.any() else 0.0
     fixed = known & (sigmas < RTK_SIGMA_M) & (rows[:, 3] >= 2.0)
+    others_m = 0.0 if fixed.all() else float(np.percentile(sigmas[~fixed], 95))
     every, places = _placed(fixes)
     old = stored(fixes.stamps_ns[every], places[:, :3])
     bad = frozen_fixes(stamps, rows[:, :2], p[:, :2])
@@ -270,6 +270,6 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         slow_error=not precise,
         rtk_share=float(fixed.mean()),
         why=why,
-        sigma_p95_m=worst_m,
+        others_p95_m=others_m,
         tf_frame=tf_frame,
     )

@@ -286,7 +286,7 @@ def _noise_lines(imu: ImuReport) -> list[str]:
 def _other_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     """The fixes of a receiver while its RTK is gone: as a second sensor, with an error of metres that the RTK does not have."""
     default = SlowErrorConfig()
-    slow_m = min(gnss.sigma_p95_m, default.horizontal_sigma_m)
+    slow_m = min(gnss.others_p95_m, default.horizontal_sigma_m)
     keys = f"horizontal_sigma_m: {slow_m:.2g}, vertical_sigma_m: {2.0 * slow_m:.2g}, time_constant_s: {_FLOAT_S:g}"
     return [
         f"{name}_other:",

@@ -23,7 +23,7 @@ _DIFFERS = 1.5  # times the default of a slow error
 # Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
 _RTK_M = (0.05, 0.1)
 _RTK_SCATTER_M = 0.1
-_BY_TURNS = 0.05  # share of the fixes, of RTK and of others
+_BY_TURNS = 0.01  # share of the fixes, of RTK and of others
 WATER = " (through water)"
 """At the end of the name of a stream of those of a Doppler log's messages that say so."""
 FILTER = " (of a filter)"
@@ -130,7 +130,7 @@ class GnssReport:
 
     Attributes:
         statuses: fixes by status name; known_covariance: share of fixes that report one.
-        reported_sigma_m: median sigma east, north, up; sigma_p95_m: horizontal sigma that 5 % of the fixes exceed; scatter_m: the white part seen in the data, the same.
+        reported_sigma_m: median sigma east, north, up; scatter_m: the white part seen in the data, the same.
         white_m: the horizontal scatter, where no motion is in it: fixes come fast, or scatter by more than a craft would.
         spans_s: time from its first fix to its last. late_s: what should be added to its stamps by the accelerometer, and
             1 sigma; None where that does not tell. late_by: whose motion told so: its own, or that of a velocity of the same device.
@@ -139,7 +139,7 @@ class GnssReport:
         wander: by how much their error changes along the way, by `wander_by`, wheels or a velocity; empty where these do not tell.
         uneven: how unevenly its fixes are stamped; None where these tell when each was measured.
         apart_m: by how much it and `apart_from`, the receiver it agrees with best, wander against each other, 1 sigma of an axis.
-        rtk_share: share of the fixes that are of fixed RTK, by their status and what they state.
+        rtk_share: share of the fixes that are of fixed RTK, by their status and what they state. others_p95_m: what of the others state up to.
         without_height: fixes without one. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
 
@@ -156,7 +156,7 @@ class GnssReport:
     slow_error: bool
     why: str
     rtk_share: float = 0.0
-    sigma_p95_m: float = 0.0
+    others_p95_m: float = 0.0
     tf_frame: str | None = None
     white_m: float | None = None
     frozen: str = ""

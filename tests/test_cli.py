@@ -85,6 +85,11 @@ def test_a_draft_from_inspect_gives_a_track(
         ("sensors:", "sensros:", "did you mean 'sensors'"),
         ("sensors:", "sensors:\n  b: {kind: gnss, topic: /gnss/fix}", "both read /gnss/fix, which would count twice"),
         (
+            "sensors:",
+            "sensors:\n  b: {kind: gnss, topic: /gnss/fix, fixes: rtk}",
+            "both read /gnss/fix, which would count twice",
+        ),
+        (
             "topic: /matcher/pose",
             "topic: /truth",
             "truth_topic: matcher fuses /truth, and a comparison with it says nothing",

@@ -708,6 +708,32 @@ def test_sensors_on_other_clocks_are_judged_by_each_other(topic: str, behind_s: 
     assert ("GPS time" in said) == (behind_s == -18)
 
 
+@pytest.mark.parametrize("astern_s", [40, 120])
+def test_a_compass_of_a_craft_that_goes_ahead_and_astern_is_mounted_as_is_likelier(
+    astern_s: int, tmp_path: Path
+) -> None:
+    """Half of the time astern, it was 'a relative or a disturbed heading', or mounted backwards; astern throughout, only the craft tells."""
+    make, items = Messages(2), []
+    for name, at, m in drive(make, seconds=120):
+        since_s = (at - START_NS) / S
+        if name == "/compass" and (since_s - 12.0) % 80.0 < astern_s:
+            m = make.compass(at, (Rotation.from_rotvec([0.0, 0.0, np.pi]) * Rotation.from_quat(xyzw(m))).as_quat())
+        if name != "/wheel/odom" and (name != "/compass" or since_s % 30.0 > 10.0):
+            items.append((name, at, m))
+    found, config, _ = look(tmp_path, items, make)
+    (compass,) = found.compasses
+    assert compass.usable
+    assert compass.backwards == (astern_s == 120)
+    assert ("of them astern" in compass.why) == (astern_s == 40)
+    assert compass.scatter_deg is not None
+    assert compass.scatter_deg < 5.0
+    assert abs(config.sensors["compass"].mount.rpy_deg[2]) == (180.0 if astern_s == 120 else 0.0)
+
+
+def xyzw(m: Any) -> tuple[float, float, float, float]:
+    return m.quaternion.x, m.quaternion.y, m.quaternion.z, m.quaternion.w
+
+
 @pytest.mark.parametrize("topic", ["/mag", "/gps/heading"])
 @pytest.mark.parametrize("swing_deg", [0.0, 6.0])
 def test_a_compass_is_drafted_as_far_as_it_wanders(topic: str, swing_deg: float, tmp_path: Path) -> None:

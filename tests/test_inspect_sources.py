@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`inspect` on bags of drivers that say much: what is a velocity, whose output a filter's is, what says the same twice."""
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, render
+from graphloc.ledger import Outcome
+from graphloc.measurements import GnssPosition
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_bag import KINDS
 from tests.test_inspect import DATUM, ROLL_90, G, drive, look, rotation_z
@@ -591,21 +594,35 @@ def test_rtk_is_taken_before_a_receiver_that_says_more(lasts_s: float, used: str
     assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == [used]
 
 
-@pytest.mark.parametrize(("floats", "sigma_m"), [(0.03, 0.03), (0.3, 0.5)])
-def test_the_slow_error_of_rtk_that_is_float_at_times_is_that_of_a_float(
-    floats: float, sigma_m: float, tmp_path: Path
-) -> None:
-    """3 cm for such a receiver: floats that were 0.4 m off were in the bounds for 70 % of the time."""
+@pytest.mark.parametrize("floats", [0.0, 0.03, 0.3, 0.97])
+def test_rtk_that_is_float_at_times_is_two_sensors(floats: float, tmp_path: Path) -> None:
+    """With the error of a float for all of them, the track was metres off where fixes were good to a centimetre; with that of RTK, floats
+    that were 0.4 m off were in the bounds for 70 % of the time. Each fix is used once.
+    """
     make = Messages(2)
-    items: list[Item] = []
+    items, wanted = list[Item](), list[int]()
     for n, (topic, at, m) in enumerate(drive(make, sigma_m=0.01, status=2)):
         if topic == "/fix" and (n * 0.618) % 1.0 < floats:
             m = make.fix(at, m.latitude, m.longitude, m.altitude, 2, (0.25 * np.eye(3)).ravel())
+            wanted.append(at)
         items.append((topic, at, m))
     _, config, _ = look(tmp_path, items, make)
-    (gnss,) = config.of_kind("gnss").values()
-    assert isinstance(gnss, GnssConfig)
-    assert gnss.slow_error.horizontal_sigma_m == pytest.approx(sigma_m)
+    found = config.of_kind("gnss")
+    assert {name: (g.fixes, g.topic, g.slow_error.horizontal_sigma_m) for name, g in found.items()} == (
+        {"gnss": ("rtk", "/fix", 0.03), "gnss_other": ("other", "/fix", 0.5)}
+        if floats
+        else {"gnss": ("any", "/fix", 0.03)}
+    )
+    assert [config.by_turns(name) for name in found] == (
+        [["gnss", "gnss_other"], ["gnss_other", "gnss"]] if floats else [["gnss"]]
+    )
+    recording = read_recording(tmp_path / "run", config)
+    used = {name: [m.stamp_ns for m in recording.of(GnssPosition) if m.sensor == name] for name in found}
+    assert used.get("gnss_other", []) == wanted
+    fixes = [at for topic, at, _ in items if topic == "/fix"]
+    assert sorted(sum(used.values(), [])) == fixes
+    left = Counter((row.sensor, row.outcome) for row in recording.rows if row.sensor in found)
+    assert left == Counter({(name, Outcome.IGNORED): len(fixes) - len(used[name]) for name in found} if floats else {})
 
 
 @pytest.mark.parametrize(("claims_m", "used"), [(1.2, "/fix"), (0.4, "/second")])

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether an angle turns as the gyroscope does: also one with gaps, and a course of a craft that goes ahead and astern."""
+
+import numpy as np
+import pytest
+
+from graphloc.frames import Array
+from graphloc.frontends._turning import Turning, against_turning, follows_turning, left_of_turns
+from graphloc.time import NS_PER_S
+
+T_S = np.arange(0.0, 360.0, 0.02)
+YAW = (
+    np.cumsum(np.where(T_S % 20.0 < 4.0, np.where(T_S % 40.0 < 20.0, 1.3, -0.3), 0.0)) * 0.02
+)  # 298 deg to port, 69 back
+TURNING = Turning(0, T_S, YAW + 0.004 * T_S)  # with a bias of its gyroscope
+NOISE = 0.02 * np.random.default_rng(0).standard_normal(len(T_S))
+
+
+def at(first_s: float, every_s: float, gaps: float) -> Array:
+    """Indices of samples, some seconds apart, in the first `gaps` seconds of each minute none."""
+    k = np.arange(round(first_s / 0.02), len(T_S), round(every_s / 0.02))
+    return np.asarray(k[T_S[k] % 60.0 >= gaps])
+
+
+def stamps(k: Array) -> Array:
+    return np.asarray(T_S[k] * NS_PER_S).astype(np.int64)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("gaps_s", [0.0, 38.0])
+def test_a_heading_that_is_silent_for_long_turns_as_the_craft_does(gaps_s: float, sign: int) -> None:
+    """Compared across the gaps, where it turned by more than half a turn, a true heading was taken for a disturbed one."""
+    k = at(1.0, 0.2, gaps_s)
+    wrapped = sign * (YAW + NOISE)[k]
+    angle = np.unwrap(np.angle(np.exp(1j * wrapped)))
+    assert (np.ptp(angle - wrapped) > 1.0) == (gaps_s > 0.0)  # turns are lost in the gaps
+    assert against_turning(TURNING, stamps(k), angle) == sign
+    assert follows_turning(TURNING, stamps(k), angle) == (sign > 0)
+
+
+@pytest.mark.parametrize("gaps_s", [0.0, 20.0])
+def test_a_course_of_a_craft_that_goes_astern_turns_as_it_does(gaps_s: float) -> None:
+    """Half a turn off from where it goes astern, the course was compared across that: the accelerations were said to be inverted."""
+    k = at(1.0, 1.0, gaps_s)
+    astern = np.floor(T_S[k] / 15.0) % 2.0
+    course = np.unwrap(np.angle(np.exp(1j * (YAW[k] + 3.0 * NOISE[k] + np.pi * astern))))
+    assert against_turning(TURNING, stamps(k), course, over_s=12.0, clear=0.6, as_much=2.0) == 1
+    assert left_of_turns(TURNING, stamps(k), course, 12.0) < 0.05
+    assert left_of_turns(Turning(0, T_S, -YAW), stamps(k), course, 12.0) > 1.0
+
+
+def test_an_angle_that_has_nothing_to_do_with_the_craft_tells_nothing() -> None:
+    k = at(1.0, 0.2, 0.0)
+    stray = np.cumsum(0.1 * np.random.default_rng(1).standard_normal(len(k)))
+    assert against_turning(TURNING, stamps(k), stray) == 0
+    assert not follows_turning(TURNING, stamps(k), stray)
