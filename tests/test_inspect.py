@@ -717,7 +717,9 @@ def test_a_compass_of_a_craft_that_goes_ahead_and_astern_is_mounted_as_is_likeli
     for name, at, m in drive(make, seconds=120):
         since_s = (at - START_NS) / S
         if name == "/compass" and (since_s - 12.0) % 80.0 < astern_s:
-            m = make.compass(at, (Rotation.from_rotvec([0.0, 0.0, np.pi]) * Rotation.from_quat(xyzw(m))).as_quat())
+            m = make.compass(
+                at, (Rotation.from_rotvec([0.0, 0.0, np.pi]) * Rotation.from_quat(xyzw(m))).as_quat().tolist()
+            )
         if name != "/wheel/odom" and (name != "/compass" or since_s % 30.0 > 10.0):
             items.append((name, at, m))
     found, config, _ = look(tmp_path, items, make)

@@ -620,7 +620,7 @@ def test_rtk_that_is_float_at_times_is_two_sensors(floats: float, tmp_path: Path
     used = {name: [m.stamp_ns for m in recording.of(GnssPosition) if m.sensor == name] for name in found}
     assert used.get("gnss_other", []) == wanted
     fixes = [at for topic, at, _ in items if topic == "/fix"]
-    assert sorted(sum(used.values(), [])) == fixes
+    assert sorted(at for stamps in used.values() for at in stamps) == fixes
     left = Counter((row.sensor, row.outcome) for row in recording.rows if row.sensor in found)
     assert left == Counter({(name, Outcome.IGNORED): len(fixes) - len(used[name]) for name in found} if floats else {})
 

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from graphloc.frames import Array
 from graphloc.frontends._turning import Turning, against_turning, follows_turning, left_of_turns
@@ -22,8 +23,8 @@ def at(first_s: float, every_s: float, gaps: float) -> Array:
     return np.asarray(k[T_S[k] % 60.0 >= gaps])
 
 
-def stamps(k: Array) -> Array:
-    return np.asarray(T_S[k] * NS_PER_S).astype(np.int64)
+def stamps(k: Array) -> NDArray[np.int64]:
+    return (T_S[k] * NS_PER_S).astype(np.int64)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
