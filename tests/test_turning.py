@@ -24,7 +24,7 @@ def at(first_s: float, every_s: float, gaps: float) -> Array:
 
 
 def stamps(k: Array) -> NDArray[np.int64]:
-    return (T_S[k] * NS_PER_S).astype(np.int64)
+    return np.asarray(T_S[k] * NS_PER_S, dtype=np.int64)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
