@@ -22,6 +22,7 @@ from graphloc.frontends._sanity import (
     NEVER_STILL_RADPS,
     missing_half,
     saturation_warning,
+    size_at_ease,
     turns_gravity,
     without_gravity,
 )
@@ -356,7 +357,7 @@ class _Units(NamedTuple):
 
 def _units_of(stamps: NDArray[np.int64], accel: Array, gyro: Array) -> _Units:
     """Return the likely units of accelerations (N, 3) and rates (N, 3), at stamps (N,) ns."""
-    size = float(np.median(np.linalg.norm(accel, axis=1)))
+    size, at_ease = size_at_ease(accel, gyro)
     rate = float(np.median(np.linalg.norm(gyro, axis=1)))
     gravity = "removed" if without_gravity(accel) else "included"
     accel_unit = "g" if gravity == "included" and 0.9 < size < 1.1 else "m/s^2"
@@ -366,7 +367,7 @@ def _units_of(stamps: NDArray[np.int64], accel: Array, gyro: Array) -> _Units:
         why.append(f"median acceleration is {size:.2f}: looks like g")
     if gravity == "removed":
         why.append(f"median acceleration is {size:.2f}: looks like gravity was removed by the driver")
-    if accel_unit == "m/s^2" and gravity == "included" and not 8.5 < size < 11.5:
+    if accel_unit == "m/s^2" and gravity == "included" and (size < 8.5 or (size > 11.5 and at_ease)):
         why.append(f"median acceleration is {size:.2f}: neither m/s^2 nor g with gravity; check the sensor")
     if gyro_unit == "deg/s":
         why.append(f"median rate is {rate:.2f}: too much for rad/s, looks like deg/s")

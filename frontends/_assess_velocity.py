@@ -35,6 +35,7 @@ _AXES = (EAST_AXES, NORTH_AXES, BODY_AXES)
 _INS = re.compile(r"(^|[/_])(o?ins|oxts|inspvax?|span)([/_]|$)", re.IGNORECASE)
 EITHER = f"{EAST_AXES}, or {BODY_AXES}"
 _OF_GNSS = re.compile(r"gps|gnss|fix|ublox|novatel|septentrio|antenna|enu", re.IGNORECASE)
+_OF_LOG = re.compile(r"dvl|doppler|wheel|speed_?log", re.IGNORECASE)
 _FEWEST = 20
 _FAR_WORSE = 5.0  # times the sigma that most fixes claim
 _ASTERN, _MOVES_MPS = 0.95, 0.3
@@ -132,6 +133,8 @@ def velocity_report(
     if axes == EITHER:
         axes = EAST_AXES if _OF_GNSS.search(f"{stream.topic} {stream.frame_id}") else BODY_AXES
         why = f"by the names of its topic and frame; {why}"
+    if axes is None and _OF_LOG.search(f"{stream.topic} {stream.frame_id}"):
+        axes, why = BODY_AXES, f"by the names of its topic and frame; {why}"
     if through_water(stream.topic):
         axes, why = BODY_AXES, f"a speed through the water; {why}"
     rows = stream.rows[sane(stream)]

@@ -28,6 +28,10 @@ _GRAVITY_S, _FEWEST_WINDOWS = 0.4, 10  # windows whose mean acceleration tells w
 _LEAST_RANGE_MPS2, _LEAST_RANGE_RADPS = 19.0, 1.7  # no IMU has less (2 g, 100 deg/s)
 # Readings at the end of the range that are no chance; the band beneath it (a share of it), in which fewer lie.
 _CUT, _BENEATH = 5, 0.03
+_LEAST_TURNING, _AT_EASE_RADPS = (
+    0.3,
+    0.3,
+)  # share of the samples, which turn least; what they turn by at most where turns are no matter
 _EXPLAINED = 0.75  # of what its direction moves by, that rates in rad/s leave at most
 
 
@@ -42,6 +46,16 @@ def lever_warning(name: str, t_body_sensor_m: Array, tf_frame: str | None) -> li
         return []
     by = f"{tf_frame} in /tf_static" if tf_frame else "mount.xyz_m"
     return [f"{name}: by {by} it sits {far_m:.0f} m from the origin of body: metres are meant; right on a ship only"]
+
+
+def size_at_ease(accel: Array, gyro_radps: Array) -> tuple[float, bool]:
+    """Return the median size of accelerations (N, 3) while the craft turns least, and whether that is little: then it is gravity's alone.
+
+    A fast one in tight circles feels as much again. Rates (N, 3) in deg/s never are little.
+    """
+    rates = np.linalg.norm(gyro_radps, axis=1)
+    least = float(np.quantile(rates, _LEAST_TURNING))
+    return float(np.median(np.linalg.norm(accel[rates <= least], axis=1))), least < _AT_EASE_RADPS
 
 
 def without_gravity(accel: Array) -> bool:
@@ -78,11 +92,11 @@ def imu_warnings(
     """Return lines on units and gravity of accelerations (N, 3) and rates (N, 3), converted as configured."""
     if len(accel_mps2) < 10:
         return []
-    g = float(np.median(np.linalg.norm(accel_mps2, axis=1)))
+    g, at_ease = size_at_ease(accel_mps2, gyro_radps)
     rate = float(np.median(np.linalg.norm(gyro_radps, axis=1)))
     lines = []
     said = f"{sensor}: median acceleration is {g:.2f} m/s^2"
-    if config.gravity != "removed" and not 8.5 < g < 11.5:
+    if config.gravity != "removed" and (g < 8.5 or (g > 11.5 and at_ease)):
         if g < 2.0:
             lines.append(f"{said}: looks like gravity was removed by the driver; set gravity: removed")
         else:

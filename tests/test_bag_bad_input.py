@@ -564,6 +564,8 @@ def test_a_mount_in_centimetres_is_said(tmp_path: Path, xyz_m: list[float], far:
         ((0, 0, 9.8), (0, 0, 0), {"gravity": "removed"}, "gravity: included"),
         ((0, 0, 9.8), (0.1, -0.1, 5.0), {}, "gyro_unit: deg/s"),  # it may pivot
         ((0, 0, 4.0), (0, 0, 0), {}, "not about 9.8"),
+        ((0, 9.8, 9.8), (0, 0, 0.1), {}, "not about 9.8"),
+        ((0, 9.8, 9.8), (0, 0, 0.4), {}, ""),  # tight circles at 25 m/s
         ((0, 0, 9.8), (0, 0, 0.2), {}, ""),
         ((0, 0, 1.0), (0, 0, 0), {"accel_unit": "g"}, ""),
         ((0.01, 0, 0.02), (0, 0, 0), {"gravity": "removed"}, ""),

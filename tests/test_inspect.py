@@ -450,6 +450,18 @@ def test_a_velocity_is_judged_without_the_noise_of_the_fixes(scatter_m: float, a
 
 
 @pytest.mark.parametrize(
+    ("topic", "frame", "axes"),
+    [("/dvl/twist", "link", BODY_AXES), ("/vel", "dvl_link", BODY_AXES), ("/vel", "link", None)],
+)
+def test_without_a_track_names_tell_a_speed_along_the_vessel(topic: str, frame: str, axes: str | None) -> None:
+    """Beneath the water there are no fixes: a Doppler log was taken for a velocity to the east and north."""
+    stream = TopicData(topic, TWIST, frame)
+    for k in range(100):
+        stream.add(START_NS + k * S, START_NS + k * S, (1.0 + 0.01 * (k % 7), 0.0, 0.0), "run.db3")
+    assert velocity_report(stream, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None).axes == axes
+
+
+@pytest.mark.parametrize(
     ("course_deg", "ahead", "axes"),
     [
         (10.0, False, EAST_AXES),

@@ -21,7 +21,7 @@ from graphloc.graph import InertialLink, InertialRow, Sensor, SlowProcess
 from graphloc.measurements import Measurement
 from graphloc.position_jumps import allowed_jump_m, position_jumps
 from graphloc.recording import Mounts, Recording
-from graphloc.time import stamps_of
+from graphloc.time import stamps_of, utc_text
 from graphloc.timeline import Timeline, make_timeline
 
 _NO_JUMPS: PositionJumps = np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -48,6 +48,17 @@ def slow_or_left_out(row: Sensor, config: SensorConfig, company: int) -> tuple[S
     return (None, slow) if slow is not None and slow.needs_company and company < 2 else (slow, None)
 
 
+def _gap_warning(gaps: Sequence[tuple[int, int]]) -> list[str]:
+    """Return a line on the gaps of the IMU, (start, stop) in ns: a radio link that drops out has dozens."""
+    if not gaps:
+        return []
+    longest_s, first = max(b - a for a, b in gaps) / 1e9, utc_text(gaps[0][0])
+    which = f"IMU gap of {longest_s:.1f} s at {first}"
+    if len(gaps) > 1:
+        which = f"{len(gaps)} IMU gaps of up to {longest_s:.1f} s, the first at {first}"
+    return [f"{which}: bridged with unknown motion"]
+
+
 def make_problem(
     recording: Recording,
     config: VesselConfig,
@@ -72,7 +83,7 @@ def make_problem(
 
     links = relink(config.sensors[imu.sensor], 1.0, R)
     inside, rejected, warnings = sorted_out(recording, config, {row.kind for row in rows}, imu)
-    warnings += [f"IMU gap of {(b - a) / 1e9:.1f} s: bridged with unknown motion" for a, b in links.gaps()]
+    warnings += _gap_warning(links.gaps())
     timeline = make_timeline(int(imu.stamps_ns[0]), int(imu.stamps_ns[-1]), inside, config.timeline)
     preintegrated = preintegrate(timeline, links)
     by_sensor: dict[str, list[Measurement]] = {}
