@@ -30,6 +30,7 @@ from graphloc.time import NS_PER_S
 
 _CHORD_S, _LONG_CHORD_S = 2.0, 10.0  # in which a craft turns little; and over which fixes wander by less than it goes
 _FOLLOWS, _NO_WANDER = 0.5, 3.0  # correlation; RMS of what is across, over that along
+_JUMP = 0.03  # of the chords, at most, that fit no axes as the fixes jump
 _FITS = 0.4  # largest error of an axis convention that fits, as a share of the speed
 _AXES = (EAST_AXES, NORTH_AXES, BODY_AXES)
 _INS = re.compile(r"(^|[/_])(o?ins|oxts|inspvax?|span)([/_]|$)", re.IGNORECASE)
@@ -69,19 +70,22 @@ def _axes_by(
     v = stream.rows[keep, -3:] if len(keep) else np.zeros((0, 3))
     chords, mean = _pairs(stream.stamps_ns[keep], v, stamps_ns, p_m, chord_s)
     noise = 2.0 * scatter_m / chord_s  # of a chord between two places, both axes together, m/s
+    forward = chords / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
+    # Body x laid along the track, either way: a craft may go astern.
+    along = forward * np.abs(mean[:, :1])
+    squared = np.array([((v - chords) ** 2).sum(axis=1) for v in (mean[:, :2], mean[:, 1::-1], along)])
+    # Where the fixes jump, none fits; a few such chords would hide all the others.
+    least = squared.min(axis=0)
+    kept = least <= np.quantile(least, 1.0 - _JUMP) if len(least) else np.zeros(0, dtype=bool)
+    chords, mean, squared = chords[kept], mean[kept], squared[:, kept]
     speed = _less(float(np.sqrt((chords**2).sum(axis=1).mean())), noise) if len(chords) else 0.0
     if len(chords) < 10 or speed < 0.5:
         return None, "no GNSS track in motion to check it against"
     if noise > speed:
         return None, f"the fixes scatter by {scatter_m:.1f} m, too much to check it against at {speed:.1f} m/s"
-    forward = chords / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
-    # Body x laid along the track, either way: a craft may go astern.
-    along = forward * np.abs(mean[:, :1])
     # What lies along the chords has their noise across them, too.
-    errors = [
-        _less(float(np.sqrt(((v - chords) ** 2).sum(axis=1).mean())), part * noise)
-        for v, part in ((mean[:, :2], 1.0), (mean[:, 1::-1], 1.0), (along, 0.5**0.5))
-    ]
+    parts = (1.0, 1.0, 0.5**0.5)
+    errors = [_less(float(np.sqrt(own.mean())), part * noise) for own, part in zip(squared, parts, strict=True)]
     best = int(np.argmin(errors))
     if _AXES[best] == BODY_AXES and errors[0] < _FITS * speed:
         own = _east_or_ahead(chords, mean)

@@ -449,6 +449,18 @@ def test_a_velocity_is_judged_without_the_noise_of_the_fixes(scatter_m: float, a
     assert (told is None) == (axes is None), why
 
 
+@pytest.mark.parametrize("jump_m", [0.0, 15.0])
+def test_a_jump_of_the_fixes_hides_no_wheels(jump_m: float) -> None:
+    """15 m for 20 s: two chords of 7 m/s, beside 1 m/s, and wheels were taken for a pose whose 'speeds are none along the craft'."""
+    t, yaw = np.arange(300.0), 0.05 * np.arange(300.0)
+    way = np.cumsum(np.column_stack([np.cos(yaw), np.sin(yaw), 0.0 * t]), axis=0)
+    way[(t >= 100.0) & (t < 120.0), :2] += jump_m * np.array([0.6, 0.8])
+    stream = TopicData("/odom", TWIST, "link")
+    for stamp in (START_NS + (t * S).astype(np.int64)).tolist():
+        stream.add(stamp, stamp, (1.0, 0.0, 0.0), "run.db3")
+    assert axes_of(stream, stream.stamps_ns, way, 0.1)[0] == BODY_AXES
+
+
 @pytest.mark.parametrize(
     ("topic", "frame", "axes"),
     [("/dvl/twist", "link", BODY_AXES), ("/vel", "dvl_link", BODY_AXES), ("/vel", "link", None)],
