@@ -2,6 +2,7 @@
 """Sentences of NMEA 0183 as a source of places, headings and velocities; messages of other packages that say the same."""
 
 import operator
+from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import reduce
@@ -315,15 +316,21 @@ def gga_bag(path: Path, quality: Callable[[int], int], damaged: int = 0) -> Path
 
 @pytest.mark.parametrize(
     ("quality", "slow_m"),
-    [(lambda _: 4, 0.03), (lambda k: 5 if k % 10 == 0 else 4, 0.3), (lambda k: 1 if k % 10 == 0 else 4, 1.5), (lambda _: 1, 2.0)],
+    [
+        (lambda _: 4, {"gnss": 0.03}), (lambda k: 5 if k % 10 == 0 else 4, {"gnss": 0.03, "gnss_other": 0.3}),
+        (lambda k: 1 if k % 10 == 0 else 4, {"gnss": 0.03, "gnss_other": 1.5}), (lambda _: 1, {"gnss": 2.0}),
+    ],
     ids=["fixed", "float at times", "no RTK at times", "no RTK"],
 )  # fmt: skip
-def test_the_slow_error_is_drafted_by_quality(quality: Callable[[int], int], slow_m: float, tmp_path: Path) -> None:
+def test_the_slow_error_is_drafted_by_quality(
+    quality: Callable[[int], int], slow_m: dict[str, float], tmp_path: Path
+) -> None:
     drafted = tmp_path / "vessel.yaml"
     drafted.write_text(draft_config(inspect_bag(gga_bag(tmp_path / "run", quality))))
-    gnss = load_config(drafted, KINDS).sensors["gnss"]
-    assert isinstance(gnss, GnssConfig)
-    assert gnss.slow_error.horizontal_sigma_m == slow_m
+    config = load_config(drafted, KINDS)
+    assert {name: g.slow_error.horizontal_sigma_m for name, g in config.of_kind("gnss").items()} == slow_m
+    fixes = Counter(m.sensor for m in read_recording(tmp_path / "run", config).measurements)
+    assert fixes == ({"gnss": 180, "gnss_other": 20} if len(slow_m) > 1 else {"gnss": 200})
 
 
 def test_a_damaged_sentence_is_not_one_without_a_fix(tmp_path: Path) -> None:
