@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from graphloc.config import GnssConfig
+from graphloc.config import GnssConfig, SlowErrorConfig
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends import _clock
 from graphloc.frontends._fixes import RTK_SIGMA_M, scatter_m, stored, stored_warning, uneven
-from graphloc.frontends._reports import GnssReport, TopicReport, Vec
+from graphloc.frontends._reports import GnssReport, PartOfFixes, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import IMU, PLAIN_POSE, POSE, UNSTAMPED
@@ -26,6 +26,7 @@ from graphloc.time import NS_PER_S, stamps_of
 from graphloc.white_noise import white_noise
 
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
+_EITHER = 0.01  # share of the fixes, at least, of RTK and of others, where it comes and goes
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
 
 
@@ -223,6 +224,28 @@ def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> M
     return MeasuredMotion(source, int(stamps_ns[0]), t, speed, p_m[:, 0] + 1j * p_m[:, 1], rests=fast)
 
 
+def _by_turns(
+    stamps_ns: NDArray[np.int64], p_m: Array, rows: Array, sigmas_m: Array, fixed: NDArray[np.bool_]
+) -> tuple[PartOfFixes, PartOfFixes] | None:
+    """Return the fixes (N,) of RTK, and the others, where a receiver has both; `rows`: of each, `sigmas_m`: what it states, horizontally."""
+    if not _EITHER <= fixed.mean() <= 1.0 - _EITHER:
+        return None
+
+    def part(of: NDArray[np.bool_]) -> PartOfFixes:
+        known = of & (rows[:, 4] > 0) & (rows[:, 5:8] > 0.0).all(axis=1)
+        # A float's error is as large as it claims; what is no RTK at all claims more for its white noise, or too little.
+        default_m = SlowErrorConfig().horizontal_sigma_m
+        slow_m = np.where(rows[of, 3] >= 2.0, np.minimum(sigmas_m[of], default_m), default_m)
+        return PartOfFixes(
+            share=float(of.mean()),
+            sigma_m=vec(np.sqrt(np.median(rows[known, 5:8], axis=0))) if known.any() else None,
+            white_m=scatter_m(stamps_ns[of], p_m[of, :2]),
+            slow_m=float(np.percentile(slow_m, 95)),
+        )
+
+    return part(fixed), part(~fixed)
+
+
 def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
     """Return status, spread and a guess on slow errors; None where there is no fix at all."""
     stamps, p, rows = track(fixes)
@@ -235,7 +258,6 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         known, np.sqrt(np.where(known, rows[:, 5:7].max(axis=1), 0.0)), GnssConfig().default_horizontal_sigma_m
     )
     fixed = known & (sigmas < RTK_SIGMA_M) & (rows[:, 3] >= 2.0)
-    others_m = 0.0 if fixed.all() else float(np.percentile(sigmas[~fixed], 95))
     every, places = _placed(fixes)
     old = stored(fixes.stamps_ns[every], places[:, :3])
     bad = frozen_fixes(stamps, rows[:, :2], p[:, :2])
@@ -268,8 +290,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         frozen="".join(frozen_fixes_warning(fixes.topic, stamps, bad)),
         stored="".join(stored_warning(fixes.topic, places[:, :3], old)),
         slow_error=not precise,
-        rtk_share=float(fixed.mean()),
+        by_turns=_by_turns(stamps[~bad], own, rows[~bad], sigmas[~bad], fixed[~bad]),
         why=why,
-        others_p95_m=others_m,
         tf_frame=tf_frame,
     )

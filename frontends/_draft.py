@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from graphloc.frontends._reports import (
     MountedTopic,
     MountGuess,
     OdometryReport,
+    PartOfFixes,
     VelocityReport,
     filtered,
     through_water,
@@ -77,7 +79,7 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     for k, gnss in enumerate(inspection.gnss):
         yield _gnss_block(_numbered("gnss", k), gnss, enabled=k == 0)
         if gnss.by_turns:
-            yield _other_block(_numbered("gnss", k), gnss, enabled=k == 0)
+            yield _other_block(_numbered("gnss", k), gnss, gnss.by_turns[1], enabled=k == 0)
     for k, item in enumerate(_in_a_grid(inspection)):
         yield _grid_block(_numbered("gnss", k), item, enabled=k == 0)
     compasses = sorted(
@@ -283,10 +285,9 @@ def _noise_lines(imu: ImuReport) -> list[str]:
     return lines
 
 
-def _other_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
+def _other_block(name: str, gnss: GnssReport, others: PartOfFixes, *, enabled: bool) -> list[str]:
     """The fixes of a receiver while its RTK is gone: as a second sensor, with an error of metres that the RTK does not have."""
-    default = SlowErrorConfig()
-    slow_m = min(gnss.others_p95_m, default.horizontal_sigma_m)
+    slow_m = others.slow_m
     keys = f"horizontal_sigma_m: {slow_m:.2g}, vertical_sigma_m: {2.0 * slow_m:.2g}, time_constant_s: {_FLOAT_S:g}"
     return [
         f"{name}_other:",
@@ -295,14 +296,22 @@ def _other_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         *_topic_lines(gnss.topic),
         *([] if enabled else [f"  enabled: false  # guess: as {name}"]),
         *_antenna_lines(gnss.tf_frame, "from tf"),
-        f"  slow_error: {{{keys}}}  # guess: as large as they claim, and other from minute to minute",
+        *_scatter_lines(_of_part(gnss, others)),
+        f"  slow_error: {{{keys}}}  # guess: as large as floats claim, metres of what is none, and other from minute to minute",
     ]
+
+
+def _of_part(gnss: GnssReport, part: PartOfFixes) -> GnssReport:
+    """Return the report with what a part of the fixes claims and scatters by."""
+    scatter = None if part.white_m is None else (part.white_m, part.white_m, part.white_m)
+    return replace(gnss, reported_sigma_m=part.sigma_m, white_m=part.white_m, scatter_m=scatter)
 
 
 def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     lines = [f"{name}:", "  kind: gnss", *_topic_lines(gnss.topic)]
     if gnss.by_turns:
-        lines.append(f"  fixes: rtk  # guess: {100.0 * gnss.rtk_share:.0f} % of the fixes; the rest is {name}_other's")
+        share = 100.0 * gnss.by_turns[0].share
+        lines.append(f"  fixes: rtk  # guess: {share:.0f} % of the fixes; the rest is {name}_other's")
     if not enabled:
         why = (
             _FILTERED
@@ -313,7 +322,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     else:
         lines += _filtered_lines(gnss.topic)
     lines += _antenna_lines(gnss.tf_frame, "from tf")
-    lines += _scatter_lines(gnss)
+    lines += _scatter_lines(_of_part(gnss, gnss.by_turns[0]) if gnss.by_turns else gnss)
     lines += _rtk_lines(gnss)
     lines += _uneven_lines(gnss)
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error and not gnss.by_turns

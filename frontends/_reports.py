@@ -23,7 +23,6 @@ _DIFFERS = 1.5  # times the default of a slow error
 # Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
 _RTK_M = (0.05, 0.1)
 _RTK_SCATTER_M = 0.1
-_BY_TURNS = 0.01  # share of the fixes, of RTK and of others
 WATER = " (through water)"
 """At the end of the name of a stream of those of a Doppler log's messages that say so."""
 FILTER = " (of a filter)"
@@ -124,6 +123,20 @@ class Change(NamedTuple):
     seen: float
 
 
+class PartOfFixes(NamedTuple):
+    """Fixes of a receiver that has RTK at times: those of it, or the others.
+
+    Attributes:
+        share: of all its fixes. sigma_m: median that they state, east, north, up. white_m: scatter of consecutive ones. slow_m: how large
+            their slow error is taken.
+    """
+
+    share: float
+    sigma_m: Vec | None
+    white_m: float | None
+    slow_m: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GnssReport:
     """A GNSS receiver.
@@ -139,7 +152,7 @@ class GnssReport:
         wander: by how much their error changes along the way, by `wander_by`, wheels or a velocity; empty where these do not tell.
         uneven: how unevenly its fixes are stamped; None where these tell when each was measured.
         apart_m: by how much it and `apart_from`, the receiver it agrees with best, wander against each other, 1 sigma of an axis.
-        rtk_share: share of the fixes that are of fixed RTK, by their status and what they state. others_p95_m: what of the others state up to.
+        by_turns: the fixes of RTK, by their status and what they state, and the others, where both come.
         without_height: fixes without one. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
 
@@ -155,8 +168,6 @@ class GnssReport:
     first: Vec
     slow_error: bool
     why: str
-    rtk_share: float = 0.0
-    others_p95_m: float = 0.0
     tf_frame: str | None = None
     white_m: float | None = None
     frozen: str = ""
@@ -171,6 +182,7 @@ class GnssReport:
     uneven: Uneven | None = None
     apart_m: float = 0.0
     apart_from: str = ""
+    by_turns: tuple[PartOfFixes, PartOfFixes] | None = None
 
     @property
     def rtk_sigma_m(self) -> tuple[float, float] | None:
@@ -180,11 +192,6 @@ class GnssReport:
             return None
         seen_m = max(self.scatter_m[:2]), self.scatter_m[2]
         return None if seen_m[0] > _RTK_SCATTER_M else (max(_RTK_M[0], seen_m[0]), max(_RTK_M[1], seen_m[1]))
-
-    @property
-    def by_turns(self) -> bool:
-        """Whether its RTK comes and goes: two sensors, each with a slow error of its own."""
-        return _BY_TURNS <= self.rtk_share <= 1.0 - _BY_TURNS
 
     @property
     def differs(self) -> bool:

@@ -219,7 +219,7 @@ def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) ->
         cov = np.zeros((3, 3))
     elif kind != _COVARIANCE_KNOWN:
         cov = np.diag(np.diagonal(cov))  # 'approximated' and 'diagonal known' promise the diagonal only
-    return _placed(place, cov, stamp_ns, seq, sensor, config)
+    return _placed(place, cov, stamp_ns, seq, sensor, config, status)
 
 
 def nmea_sigmas_m(fix: nmea.Fix, default_m: tuple[float, float]) -> tuple[float, float]:
@@ -238,7 +238,7 @@ def _gnss_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfi
         return rejected(f"quality {fix.quality} is below min_status '{config.min_status}'")
     horizontal, vertical = nmea_sigmas_m(fix, (config.default_horizontal_sigma_m, config.default_vertical_sigma_m))
     cov = np.diag([horizontal, horizontal, vertical]) ** 2
-    return _placed((fix.latitude_deg, fix.longitude_deg, fix.height_m), cov, stamp_ns, seq, sensor, config)
+    return _placed((fix.latitude_deg, fix.longitude_deg, fix.height_m), cov, stamp_ns, seq, sensor, config, status)
 
 
 @lru_cache(maxsize=8)
@@ -266,9 +266,15 @@ def _gnss_grid(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfi
 
 
 def _placed(
-    place: tuple[float, float, float], cov: Array, stamp_ns: int, seq: int, sensor: str, config: GnssConfig
+    place: tuple[float, float, float],
+    cov: Array,
+    stamp_ns: int,
+    seq: int,
+    sensor: str,
+    config: GnssConfig,
+    status: int = _MIN_STATUS["gbas"],
 ) -> Decoded:
-    """Return a fix at latitude and longitude, deg, and height, m (NaN: unknown)."""
+    """Return a fix at latitude and longitude, deg, and height, m (NaN: unknown); `status`: where its message has one."""
     lat, lon, height = place
     if not np.isfinite([lat, lon]).all():
         return malformed("latitude or longitude is NaN")
@@ -291,8 +297,9 @@ def _placed(
         default[2] = NO_HEIGHT_M2
     stated = usable_covariance(cov, default)
     sigma_m = float(np.sqrt(np.diag(stated)[:2].max()))
-    if config.fixes != "any" and (sigma_m < RTK_SIGMA_M) != (config.fixes == "rtk"):
-        return ignored(f"it states {sigma_m:.2g} m, and fixes is {config.fixes}")
+    rtk = status >= _MIN_STATUS["gbas"] and sigma_m < RTK_SIGMA_M
+    if config.fixes != "any" and rtk != (config.fixes == "rtk"):
+        return ignored(f"it states {sigma_m:.2g} m with status {status}, and fixes is {config.fixes}")
     return GnssPosition(
         stamp_ns=stamp_ns, sensor=sensor, seq=seq, position=Geodetic(lat, lon, height), cov_enu_m2=stated
     )
@@ -507,7 +514,7 @@ def _by_maker(part: Part) -> Decoder:
                 if said.status < _MIN_STATUS[config.min_status]:
                     return rejected(f"fix status {said.status} is below min_status '{config.min_status}'")
                 cov = np.diag([said.horizontal_m, said.horizontal_m, said.vertical_m]) ** 2
-                return _placed(said[:3], cov, stamp_ns, seq, sensor, config)
+                return _placed(said[:3], cov, stamp_ns, seq, sensor, config, said.status)
             case SaidVelocity():
                 cov = np.diag([said.horizontal_mps, said.horizontal_mps, said.vertical_mps]) ** 2
                 v, cov = (said.v_mps, cov) if part.told else _in_enu(said.v_mps, cov, config)

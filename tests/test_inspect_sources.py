@@ -625,6 +625,26 @@ def test_rtk_that_is_float_at_times_is_two_sensors(floats: float, tmp_path: Path
     assert left == Counter({(name, Outcome.IGNORED): len(fixes) - len(used[name]) for name in found} if floats else {})
 
 
+@pytest.mark.parametrize("claims_m", [0.05, 500.0])
+def test_what_a_receiver_claims_without_rtk_is_nothing_to_its_rtk(claims_m: float, tmp_path: Path) -> None:
+    """Centimetres without RTK were taken for RTK; a placeholder for the others' sigma scaled that of RTK."""
+    make = Messages(2)
+    items = list[Item]()
+    for topic, at, m in drive(make, sigma_m=0.02, status=2, seconds=120):
+        rtk = (at - START_NS) / S % 60.0 > 5.0
+        if topic == "/fix" and not rtk:
+            m = make.fix(at, m.latitude, m.longitude, m.altitude, 0, (claims_m**2 * np.eye(3)).ravel())
+        items.append((topic, at, m))
+    _, config, _ = look(tmp_path, items, make)
+    rtk, other = config.sensors["gnss"], config.sensors["gnss_other"]
+    assert (rtk.fixes, rtk.sigma_scale, rtk.slow_error.horizontal_sigma_m) == ("rtk", 1.0, 0.03)
+    assert (other.fixes, other.slow_error.horizontal_sigma_m) == ("other", 2.0)
+    assert other.sigma_scale == (1.0 if claims_m < 1.0 else pytest.approx(1.5 / 500.0, rel=0.05))
+    recording = read_recording(tmp_path / "run", config)
+    assert Counter(m.sensor for m in recording.of(GnssPosition)) == {"gnss": 548, "gnss_other": 52}
+    assert not [line for line in recording.warnings if "bursts" in line]
+
+
 @pytest.mark.parametrize(("claims_m", "used"), [(1.2, "/fix"), (0.4, "/second")])
 def test_a_receiver_that_claims_more_accuracy_is_taken_before_one_that_says_more(
     claims_m: float, used: str, tmp_path: Path

@@ -318,7 +318,7 @@ def gga_bag(path: Path, quality: Callable[[int], int], damaged: int = 0) -> Path
     ("quality", "slow_m"),
     [
         (lambda _: 4, {"gnss": 0.03}), (lambda k: 5 if k % 10 == 0 else 4, {"gnss": 0.03, "gnss_other": 0.3}),
-        (lambda k: 1 if k % 10 == 0 else 4, {"gnss": 0.03, "gnss_other": 1.5}), (lambda _: 1, {"gnss": 2.0}),
+        (lambda k: 1 if k % 10 == 0 else 4, {"gnss": 0.03, "gnss_other": 2.0}), (lambda _: 1, {"gnss": 2.0}),
     ],
     ids=["fixed", "float at times", "no RTK at times", "no RTK"],
 )  # fmt: skip
