@@ -295,13 +295,20 @@ def _placed(
         cov = cov.copy()
         cov[2, :] = cov[:, 2] = 0.0  # what the message claims of a height that it does not give
         default[2] = NO_HEIGHT_M2
-    stated = usable_covariance(cov, default)
-    sigma_m = float(np.sqrt(np.diag(stated)[:2].max()))
-    rtk = status >= _MIN_STATUS["gbas"] and sigma_m < RTK_SIGMA_M
-    if config.fixes != "any" and rtk != (config.fixes == "rtk"):
-        return ignored(f"it states {sigma_m:.2g} m with status {status}, and fixes is {config.fixes}")
+    if config.fixes != "any":
+        variance = np.diagonal(cov)[:2]
+        known = np.isfinite(variance).all() and bool((variance > 0.0).all())
+        rtk = status >= _MIN_STATUS["gbas"] and known and float(variance.max()) < RTK_SIGMA_M**2
+        if rtk != (config.fixes == "rtk"):
+            return ignored(
+                f"{'of RTK' if rtk else 'without RTK'}, by its status and what it states, and fixes is {config.fixes}"
+            )
     return GnssPosition(
-        stamp_ns=stamp_ns, sensor=sensor, seq=seq, position=Geodetic(lat, lon, height), cov_enu_m2=stated
+        stamp_ns=stamp_ns,
+        sensor=sensor,
+        seq=seq,
+        position=Geodetic(lat, lon, height),
+        cov_enu_m2=usable_covariance(cov, default),
     )
 
 

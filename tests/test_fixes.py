@@ -74,6 +74,20 @@ def test_places_held_by_a_driver_count_once(tmp_path: Path) -> None:
     assert "351 of 400 fixes repeat" in line
 
 
+@pytest.mark.parametrize("default_m", [0.05, 1.5])
+def test_fixes_that_state_nothing_are_not_of_rtk(default_m: float, tmp_path: Path) -> None:
+    """Whatever they are taken for: else both sensors of a receiver may read them, or neither."""
+    items = [
+        (topic, at, MAKE.fix(at, 57.7, 11.9 + 1e-6 * k, 40.0, 2, np.zeros(9), 0))
+        for k, (topic, at, _) in enumerate(fixes())
+    ]
+    used = {
+        part: len(read(tmp_path / part, items, fixes=part, default_horizontal_sigma_m=default_m).of(GnssPosition))
+        for part in ("rtk", "other")
+    }
+    assert used == {"rtk": 0, "other": len(items)}
+
+
 @pytest.mark.parametrize("every", [1, 50])
 def test_fixes_that_move_or_stand_are_kept(every: int, tmp_path: Path) -> None:
     """A receiver that says the same for 5 s holds still itself."""

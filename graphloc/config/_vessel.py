@@ -163,8 +163,8 @@ class VesselConfig(Block):
         own = self.sensors[name]
         if getattr(own, "fixes", "any") == "any":
             return [name]
-        read = {n: s for n, s in self.of_kind(own.kind).items() if s.topic == own.topic and s.fixes != "any"}
-        return [name, *(n for n in read if n != name)]
+        others = {n: s for n, s in self.of_kind(own.kind).items() if n != name and s.fixes != "any"}
+        return [name, *(n for n, s in others.items() if (s.topic, s.nmea) == (own.topic, own.nmea))]
 
     def of_kind(self, kind: str) -> dict[str, Any]:
         """Return the enabled sensors of a kind, by name."""
