@@ -46,7 +46,9 @@ def gnss_offset_warnings(
     lines = []
     measured = {m.sensor for m in recording.measurements if m.seq >= 0}
     for name, sensor in config.of_kind("gnss").items():
-        others = [n for kind in _PLACES for n in config.of_kind(kind) if n != name and n in measured]
+        others = [
+            n for kind in _PLACES for n in config.of_kind(kind) if n not in config.by_turns(name) and n in measured
+        ]
         fixes = recording.of(GnssPosition, name)
         if sensor.slow_error.enabled is False or not others:
             continue

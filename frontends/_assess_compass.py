@@ -28,7 +28,8 @@ _ASKEW_DEG = 15.0  # antennas are mounted along a vessel or athwart, to this
 _BLOCK_S = 30
 _SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
 _SIDEWAYS_DEG = 45.0  # to which scatter courses still tell by which quarter turn two antennas are mounted
-_EITHER_WAY = 0.15  # of the courses, least share either way of a vessel that goes ahead and astern
+# Of a vessel that goes ahead and astern: least share of the courses either way; how often it turns back; share of the way it goes mostly.
+_EITHER_WAY, _OFTEN, _MOST = 0.15, 0.1, 0.6
 _RELATIVE_DEG = 30.0  # off the course, from which an IMU's orientation has a north of its own
 
 
@@ -166,15 +167,20 @@ def _beside_courses(
 def _beside_either_way(apart: Array) -> tuple[float, float, float]:
     """Return by how much a heading is off courses (N,), rad: middle and 1 sigma, deg, and on what share of them the vessel goes astern.
 
-    One that goes ahead and astern has two middles, half a turn apart: that nearer to 0 is how the heading is mounted.
+    One that goes ahead and astern, for a while each, has two middles, half a turn apart: that of most courses is how the heading is
+    mounted, or, where neither is, that nearer to the bow.
     """
     offset_deg, scatter_deg = _middle_deg(apart)
     twice_deg, twice_scatter_deg = _middle_deg(2.0 * apart)
-    ahead_deg = 0.5 * twice_deg  # within 90 deg of 0
-    astern = float((np.abs(wrap_angle(apart - np.radians(ahead_deg))) > np.pi / 2.0).mean())
-    if 0.5 * twice_scatter_deg > _SCATTERS_DEG or not _EITHER_WAY < astern < 1.0 - _EITHER_WAY:
+    bow_deg = 0.5 * twice_deg  # within 90 deg of it
+    over = np.abs(wrap_angle(apart - np.radians(bow_deg))) > np.pi / 2.0
+    share = float(over.mean())
+    leaps = float((over[1:] != over[:-1]).mean()) if len(over) > 1 else 0.0
+    if 0.5 * twice_scatter_deg > _SCATTERS_DEG or leaps > _OFTEN or not _EITHER_WAY < share < 1.0 - _EITHER_WAY:
         return offset_deg, scatter_deg, 0.0
-    return ahead_deg, 0.5 * twice_scatter_deg, astern
+    if share > (_MOST if abs(bow_deg) < _SIDEWAYS_DEG else 0.5):
+        return float(np.degrees(wrap_angle(np.radians(bow_deg + 180.0)))), 0.5 * twice_scatter_deg, 1.0 - share
+    return bow_deg, 0.5 * twice_scatter_deg, share
 
 
 def _why(fit: _Fit, by_gyro: str | None, *, told: bool, fits_course: bool, sideways: bool) -> str:

@@ -287,8 +287,12 @@ def _noise_lines(imu: ImuReport) -> list[str]:
 
 def _other_block(name: str, gnss: GnssReport, others: PartOfFixes, *, enabled: bool) -> list[str]:
     """The fixes of a receiver while its RTK is gone: as a second sensor, with an error of metres that the RTK does not have."""
-    slow_m = others.slow_m
-    keys = f"horizontal_sigma_m: {slow_m:.2g}, vertical_sigma_m: {2.0 * slow_m:.2g}, time_constant_s: {_FLOAT_S:g}"
+    own, slow_m = _of_part(gnss, others), others.slow_m
+    if slow_m >= SlowErrorConfig().horizontal_sigma_m:
+        slow_m = max(slow_m, _as_large(own)[0])
+    wanders = gnss.height_range_m > _HEIGHT_WANDERS_M
+    vertical_m = max(2.0 * slow_m, gnss.height_range_m / 3.3 if wanders else 0.0)
+    keys = f"horizontal_sigma_m: {slow_m:.2g}, vertical_sigma_m: {vertical_m:.2g}, time_constant_s: {_FLOAT_S:g}"
     return [
         f"{name}_other:",
         "  kind: gnss",
@@ -296,9 +300,14 @@ def _other_block(name: str, gnss: GnssReport, others: PartOfFixes, *, enabled: b
         *_topic_lines(gnss.topic),
         *([] if enabled else [f"  enabled: false  # guess: as {name}"]),
         *_antenna_lines(gnss.tf_frame, "from tf"),
-        *_scatter_lines(_of_part(gnss, others)),
+        *_scatter_lines(own),
+        *([_wandering(gnss)] if wanders else []),
         f"  slow_error: {{{keys}}}  # guess: as large as floats claim, metres of what is none, and other from minute to minute",
     ]
+
+
+def _wandering(gnss: GnssReport) -> str:
+    return f"  min_vertical_sigma_m: 5.0  # guess: height ranges over {gnss.height_range_m:.0f} m"
 
 
 def _of_part(gnss: GnssReport, part: PartOfFixes) -> GnssReport:
@@ -327,7 +336,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
     lines += _uneven_lines(gnss)
     wanders = gnss.height_range_m > _HEIGHT_WANDERS_M and gnss.slow_error and not gnss.by_turns
     if wanders:
-        lines.append(f"  min_vertical_sigma_m: 5.0  # guess: height ranges over {gnss.height_range_m:.0f} m")
+        lines.append(_wandering(gnss))
     if gnss.by_turns or not gnss.slow_error:
         why = f"status gbas (RTK) and less than {RTK_SIGMA_M:g} m" if gnss.by_turns else gnss.why
         lines.append(f"  slow_error: {{{_RTK_SLOW_ERROR}}}  # guess: {why}")

@@ -119,7 +119,8 @@ def _streams(
 ) -> tuple[Stream, ...]:
     """Return the streams of the sensors that have measurements, attached to the states of a problem that has none yet."""
     by_kind = {row.kind: row for row in rows}
-    alone = sum(by_kind[problem.config.sensors[name].kind].absolute for name in by_sensor) == 1
+    absolute = [name for name in by_sensor if by_kind[problem.config.sensors[name].kind].absolute]
+    alone = len({min(problem.config.by_turns(name)) for name in absolute}) == 1
     found = []
     for number, (name, config) in enumerate(problem.config.sensors.items()):
         if name not in by_sensor:
@@ -157,8 +158,10 @@ def _slow_and_jumps(
     """Return `slow`, `left_out` and `position_jumps` of a `Stream`; `alone`: one sensor measures position."""
     slow, left_out = slow_or_left_out(row, config, company)
     jumps = _NO_JUMPS
-    if alone and slow is None and row.absolute and row.false is None:
-        jumps = _position_jumps(row, measurements, datum, allowed_jump_m(left_out))
+    # What a receiver says with and without RTK is told apart by its slow errors, but neither holds the place while the other jumps.
+    by_turns = getattr(config, "fixes", "any") != "any"
+    if alone and (slow is None or by_turns) and row.absolute and row.false is None:
+        jumps = _position_jumps(row, measurements, datum, allowed_jump_m(left_out or slow))
     if left_out is not None and len(jumps[0]):
         slow, left_out = without_drift(left_out), None
     return slow, left_out, jumps

@@ -111,7 +111,9 @@ class ReceiverChecks:
     def _check_jump(
         self, stream: LiveStream, stamp_ns: int, told_m: Array, sigma_m: float, off: OffPrediction | None
     ) -> None:
-        if only_position_sensor(stream, [s for s in self._problem.streams.values() if s.row.absolute]):
+        same = self._problem.config.by_turns(stream.name)[1:]
+        absolute = [s for s in self._problem.streams.values() if s.row.absolute and s.name not in same]
+        if only_position_sensor(stream, absolute):
             slow = stream.left_out or stream.slow
             allowed = slow is not None
             found = stream.receiver.jump.note(stamp_ns, told_m, sigma_m, allowed_m=allowed_jump_m(slow), off=off)
