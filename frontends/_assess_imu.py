@@ -28,7 +28,7 @@ from graphloc.frontends._sanity import (
 )
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._turning import Turning, against_turning, left_of_turns
+from graphloc.frontends._turning import Turning, course_against_turning, left_of_turns
 from graphloc.frozen_imu import frozen_imu_warning, frozen_samples
 from graphloc.imu_spikes import spike_warning, spikes
 from graphloc.measurements import ImuSeries
@@ -37,9 +37,7 @@ from graphloc.time import NS_PER_S
 from graphloc.white_noise import white_noise
 
 # Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
-_COURSE_S, _COURSE_CLEAR, _LEFT_OF_TURNS = 12.0, 0.6, 0.5
-# To this factor a course turns as the craft does, either way; where she is set sideways while her bow comes round, by a fifth of it.
-_AS_MUCH = 2.0
+_COURSE_S, _LEFT_OF_TURNS = 12.0, 0.5
 _UPSIDE_DOWN_DEG = 150.0
 # Quiet seconds in a row; for how long it is slow, at most, that only changes its direction.
 _QUIET_S, _STANDS_S = 2, 1.5
@@ -223,7 +221,7 @@ def _against_courses(imu: TopicData, report: ImuReport, courses: Courses | None,
     if courses is None or len(courses.stamps_ns) < 20:
         return 0
     turning, course = turning_of(imu, report, tree, body), np.unwrap(courses.course_rad)
-    return against_turning(turning, courses.stamps_ns, course, _COURSE_S, _COURSE_CLEAR, _AS_MUCH)
+    return course_against_turning(turning, courses.stamps_ns, course, _COURSE_S)
 
 
 def _turning_axis(

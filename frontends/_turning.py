@@ -17,6 +17,7 @@ _STEADY_S = 120.0  # within it a gyro's bias and a compass's offset are steady
 _FEWEST = 20  # angles, or changes of them, that tell anything
 # Times the span that changes are compared over: more is a gap. What an angle leaps by beside the turning, of either sense.
 _GAP, _LEAP_RAD = 1.5, 2.0
+_CLEARLY = 0.5  # what a course and the craft's turns differ by, of what they would if it turned the other way
 _FOLLOWS_DEG, _FOLLOWS = 8.0, 3.0  # most RMS of what a heading and the gyroscope differ by; turns over that
 
 
@@ -35,28 +36,36 @@ def against_turning(
     angle: Array,
     over_s: float = 2.0,
     clear: float = 0.5,
-    as_much: float = np.inf,
 ) -> int:
     """Return +1 where an angle grows as the craft turns to port, -1 where it falls, 0 where nothing tells.
 
     Args:
         at_ns: (N,), increasing. angle: (N,) rad, unwrapped. over_s: time over which changes are compared: a gyro's bias
-            must be small beside them, and the angle's noise average out. clear: correlation that is believed. as_much: factor to
-            which the angle turns by as much as the craft does.
+            must be small beside them, and the angle's noise average out. clear: correlation that is believed.
     """
     a, b = _changes(*_beside(turning, at_ns, angle), over_s)
     if len(a) < _FEWEST:
         return 0
     power = float(np.sqrt((a**2).sum() * (b**2).sum()))
     together = float((a * b).sum())
-    if not abs(together) > clear * power:
+    return int(np.sign(together)) if abs(together) > clear * power else 0
+
+
+def course_against_turning(turning: Turning, at_ns: NDArray[np.int64], course: Array, over_s: float) -> int:
+    """Return the same of a course: to half a turn, as it is where the craft goes astern, and if it turns by about as much as the craft does.
+
+    Args:
+        at_ns, angle, over_s: as for `against_turning`.
+    """
+    a, b = _changes(*_beside(turning, at_ns, course), over_s)
+    if len(a) < _FEWEST:
         return 0
-    slope = abs(together) / float((b**2).sum())  # noise of the angle averages out, and the gyroscope has hardly any
-    return int(np.sign(together)) if 1.0 / as_much <= slope <= as_much else 0
+    along, against = (rms(_to_half_a_turn(a - sense * b)) for sense in (1.0, -1.0))
+    return int(along < _CLEARLY * against) - int(against < _CLEARLY * along)
 
 
 def left_of_turns(turning: Turning, at_ns: NDArray[np.int64], angle: Array, over_s: float) -> float:
-    """Return what part of the changes of an angle a turning leaves, squared: 0 where it turns as the craft does, 1 where that stands; inf where nothing tells.
+    """Return what part of the changes of a course, to half a turn, a turning leaves, squared: 0 where it turns as the craft does; inf where nothing tells.
 
     Args:
         at_ns: (N,), increasing. angle: (N,) rad, unwrapped. over_s: as for `against_turning`.
@@ -64,8 +73,12 @@ def left_of_turns(turning: Turning, at_ns: NDArray[np.int64], angle: Array, over
     a, b = _changes(*_beside(turning, at_ns, angle), over_s)
     if len(a) < _FEWEST:
         return np.inf
-    power = float((a**2).sum())
-    return float(((a - b) ** 2).sum()) / power if power > 0.0 else np.inf
+    power = float((_to_half_a_turn(a) ** 2).sum())
+    return float((_to_half_a_turn(a - b) ** 2).sum()) / power if power > 0.0 else np.inf
+
+
+def _to_half_a_turn(angle: Array) -> Array:
+    return 0.5 * wrap_angle(2.0 * angle)
 
 
 def follows_turning(turning: Turning | None, at_ns: NDArray[np.int64], yaw: Array) -> bool:

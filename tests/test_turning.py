@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graphloc.frames import Array
-from graphloc.frontends._turning import Turning, against_turning, follows_turning, left_of_turns
+from graphloc.frames import Array, wrap_angle
+from graphloc.frontends._assess_compass import _beside_either_way
+from graphloc.frontends._turning import Turning, against_turning, course_against_turning, follows_turning, left_of_turns
 from graphloc.time import NS_PER_S
 
 T_S = np.arange(0.0, 360.0, 0.02)
@@ -45,9 +46,40 @@ def test_a_course_of_a_craft_that_goes_astern_turns_as_it_does(gaps_s: float) ->
     k = at(1.0, 1.0, gaps_s)
     astern = np.floor(T_S[k] / 15.0) % 2.0
     course = np.unwrap(np.angle(np.exp(1j * (YAW[k] + 3.0 * NOISE[k] + np.pi * astern))))
-    assert against_turning(TURNING, stamps(k), course, over_s=12.0, clear=0.6, as_much=2.0) == 1
+    assert course_against_turning(TURNING, stamps(k), course, 12.0) == 1
+    assert course_against_turning(Turning(0, T_S, -YAW), stamps(k), course, 12.0) == -1
+    sideways = YAW[k] / 5.0 + NOISE[k]  # set by the wind, while the bow comes round
+    assert course_against_turning(TURNING, stamps(k), sideways, 12.0) == 0
     assert left_of_turns(TURNING, stamps(k), course, 12.0) < 0.05
     assert left_of_turns(Turning(0, T_S, -YAW), stamps(k), course, 12.0) > 1.0
+
+
+@pytest.mark.parametrize(
+    ("mounted_deg", "astern", "found_deg", "share"),
+    [
+        (0.0, 0.45, 0.0, 0.45),
+        (180.0, 0.28, 180.0, 0.28),
+        (-100.0, 0.28, -100.0, 0.28),
+        (90.0, 0.3, 90.0, 0.3),
+        (0.0, 0.0, 0.0, 0.0),
+    ],
+)
+def test_a_heading_is_mounted_as_most_courses_say(
+    mounted_deg: float, astern: float, found_deg: float, share: float
+) -> None:
+    """Half a turn off on some courses: of two that are alike, the one nearer to the bow."""
+    legs = np.arange(1000) % 100 < 100 * astern
+    apart = np.radians(mounted_deg) + np.pi * legs + 0.05 * np.random.default_rng(2).standard_normal(1000)
+    offset_deg, scatter_deg, told = _beside_either_way(np.asarray(wrap_angle(apart)))
+    assert abs(wrap_angle(np.radians(offset_deg - found_deg))) < np.radians(1.0)
+    assert told == pytest.approx(share)
+    assert scatter_deg < 5.0
+
+
+def test_a_heading_that_leaps_is_none() -> None:
+    """Half a turn off now and then is no craft that turns back."""
+    leaps = np.random.default_rng(3).random(1000) < 0.3
+    assert _beside_either_way(np.pi * leaps)[2] == 0.0
 
 
 def test_an_angle_that_has_nothing_to_do_with_the_craft_tells_nothing() -> None:
