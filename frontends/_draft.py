@@ -45,9 +45,8 @@ _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 _ANTENNA_OFF_M = 1.0  # from the IMU: of a car; 4 m on a boat or 0.3 m on a robot are found with it as well
 _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off: else a wrong fix draws the track along
-_FLOAT_S = (
-    60.0  # for how long the error of a float or single fix stays the same: anchored by RTK, its growth is the bound
-)
+# For how long the error of a float or single fix stays the same: from where RTK was, its growth is the bound.
+_FLOAT_S = 60.0
 _FILTERED = "by its name, or its messages, a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
 _MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; drivers may publish each packet
 _TURN_S = 0.1

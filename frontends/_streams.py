@@ -201,10 +201,9 @@ class TopicData:
     tuples: list[tuple[float, ...]] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
     elapsed: list[int] = field(default_factory=list)
-    _rows: Array | None = field(default=None, compare=False)  # as below, of `tuples`, which copies share
-    _made: dict[str, NDArray[np.int64]] = field(
-        default_factory=dict, init=False, compare=False
-    )  # of the lists, once each
+    # Made of the lists, once each; copies share the rows.
+    _rows: Array | None = field(default=None, compare=False)
+    _made: dict[str, NDArray[np.int64]] = field(default_factory=dict, init=False, compare=False)
 
     def add(self, stamp_ns: int, log_ns: int, row: tuple[float, ...], file: str, elapsed_ns: int = 0) -> None:
         """Append a message."""
