@@ -17,8 +17,8 @@ import numpy as np
 from graphloc.config import AerialConfig
 from graphloc.factors import pose
 from graphloc.frames import Array, skew
-from graphloc.graph import LATE, Attachment, Decision, GraphUpdate, Residual, SlowProcess
-from graphloc.measurements import PoseFix, PoseMode
+from graphloc.graph import LATE, Attachment, Residual, SlowProcess
+from graphloc.measurements import PoseFix
 
 _AXES = ("x", "y", "yaw")
 
@@ -52,28 +52,11 @@ def _by_turning(axes: tuple[str, ...], config: AerialConfig, at: Attachment) -> 
 
 def residuals(m: PoseFix, config: AerialConfig, at: Attachment) -> tuple[Residual, ...]:
     """Return predicted - measured (k,), m and rad, for each mode."""
-    plain = pose.residuals(m, config, at)
+    plain = pose.without_slow(m, config, at)
     if at.slow_value is None:
         return plain
     shown, by_pose = _shown_off(m.axes, config, at), plain[0].jacobian() + _by_turning(m.axes, config, at)
-    moved, flat = shown @ at.slow_value, [k for k, a in enumerate(m.axes) if a in ("x", "y")]
-    turned = [k for k, a in enumerate(m.axes) if a == "yaw"]
-    return tuple(
-        replace(
-            r,
-            raw=r.raw + moved,
-            jacobian=lambda: by_pose,
-            slow_jacobian=lambda: shown,
-            size_m=float(np.linalg.norm((r.raw + moved)[flat])) if flat else None,
-            size_deg=float(np.degrees(np.linalg.norm((r.raw + moved)[turned]))) if turned else None,
-        )
-        for r in plain
-    )
-
-
-def factors(m: PoseFix, config: AerialConfig, at: Attachment, decision: Decision) -> GraphUpdate | None:
-    """Return the native factor of the chosen mode; None where image, mounts or clock may be off."""
-    return pose.factors(m, config, at, decision) if at.slow_key is None else None
+    return tuple(pose.with_slow(r, m.axes, at.slow_value, shown, by_pose) for r in plain)
 
 
 def slow(config: AerialConfig) -> SlowProcess | None:
@@ -94,12 +77,8 @@ def slow(config: AerialConfig) -> SlowProcess | None:
 
 def ideal(at: Attachment, config: AerialConfig) -> PoseFix:
     """Return the noise-free match at the attachment's state."""
-    found = pose.ideal(at, config)
-    moved = np.zeros(len(config.axes)) if at.slow_value is None else _shown_off(config.axes, config, at) @ at.slow_value
-    mode = PoseMode(value=found.modes[0].value + moved, cov=found.modes[0].cov)
-    return replace(found, sensor="aerial", modes=(mode,))
+    found = replace(pose.ideal_without_slow(at, config), sensor="aerial")
+    return found if at.slow_value is None else pose.moved(found, _shown_off(config.axes, config, at) @ at.slow_value)
 
 
-ROW = replace(
-    pose.ROW, kind="aerial", config=AerialConfig, residuals=residuals, factors=factors, ideal=ideal, slow=slow
-)
+ROW = replace(pose.ROW, kind="aerial", config=AerialConfig, residuals=residuals, ideal=ideal, slow=slow)

@@ -10,10 +10,15 @@ Exact when re-anchored (measured: anchored level it is 11 % wrong at 3 deg of ro
 the solver does every pass. Rotation errors are small rotations about the world's axes, as in ROS.
 Each mode is a hypothesis, and so is 'none of them'; the solver weighs them. Not handled: pitch near
 +-90 deg where roll and yaw are measured alone.
+
+An error d that poses share for a while (`PoseConfig.slow_error`; first-order Gauss-Markov, in x, y, z and yaw as measured) is added to
+what is predicted, `e = Log(anchor^-1 T_world_body) + d`; the factor then has two states, and is relinearised at every pass
+(`graphloc.linear`).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -23,7 +28,7 @@ from graphloc import gauss
 from graphloc.config import AnyPoseConfig, PoseConfig
 from graphloc.factors._noise import robust, with_floors
 from graphloc.frames import Array, Datum
-from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor
+from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import AXES, PoseFix, PoseMode
 
 _WIDE_M, _WIDE_RAD = 1e3, 1e2
@@ -46,8 +51,8 @@ def _measured_sensor_pose(mode: PoseMode, axes: tuple[str, ...], T_world_sensor:
     return gtsam.Pose3(gtsam.Rot3.RzRyRx(values[3:]), values[:3])
 
 
-def residuals(m: PoseFix, config: AnyPoseConfig, at: Attachment) -> tuple[Residual, ...]:
-    """Return predicted - measured (k,), m and rad, for each mode."""
+def without_slow(m: PoseFix, config: AnyPoseConfig, at: Attachment) -> tuple[Residual, ...]:
+    """Return predicted - measured (k,), m and rad, for each mode, as if nothing slow were added to what is measured."""
     T_world_sensor = at.T_world_body.compose(at.T_state_sensor)
     R = T_world_sensor.rotation().matrix()
     picked = [AXES.index(a) for a in m.axes]
@@ -57,19 +62,97 @@ def residuals(m: PoseFix, config: AnyPoseConfig, at: Attachment) -> tuple[Residu
         Z = _measured_sensor_pose(mode, m.axes, T_world_sensor)
         rotation = gtsam.Rot3.Logmap(gtsam.Rot3(R @ Z.rotation().matrix().T))
         raw = np.concatenate([T_world_sensor.translation() - Z.translation(), rotation])[picked]
-        angles = raw[[i for i, p in enumerate(picked) if p >= 3]]
-        lengths = raw[[i for i, p in enumerate(picked) if p < 2]]
         found.append(
             Residual(
                 raw=raw,
                 cov=_covariance(mode, m.axes, config),
                 jacobian=lambda: world[picked],
                 prior=mode.probability * (1.0 - _false_probability(m, config)) / _stated(m),
-                size_m=float(np.linalg.norm(lengths)) if len(lengths) else None,
-                size_deg=float(np.degrees(np.linalg.norm(angles))) if len(angles) else None,
+                size_m=_size_m(raw, m.axes),
+                size_deg=_size_deg(raw, m.axes),
             )
         )
     return tuple(found)
+
+
+def _length(raw: Array, axes: tuple[str, ...], of: tuple[str, ...]) -> float | None:
+    """Return the length of some components of a residual (k,); None where it has none of them."""
+    picked = raw[[i for i, a in enumerate(axes) if a in of]]
+    return float(np.linalg.norm(picked)) if len(picked) else None
+
+
+def _size_m(raw: Array, axes: tuple[str, ...]) -> float | None:
+    return _length(raw, axes, AXES[:2])
+
+
+def _size_deg(raw: Array, axes: tuple[str, ...]) -> float | None:
+    size = _length(raw, axes, AXES[3:])
+    return None if size is None else float(np.degrees(size))
+
+
+def with_slow(plain: Residual, axes: tuple[str, ...], value: Array, shown: Array, by_pose: Array) -> Residual:
+    """Return a residual with what a slow state adds to it.
+
+    Args:
+        value: (n,) of the slow state. shown: (k, n) d raw / d (slow state). by_pose: (k, 6) d raw / d (body tangent of the state's pose), with what the slow state does.
+    """
+    raw = plain.raw + shown @ value
+    return replace(
+        plain,
+        raw=raw,
+        jacobian=lambda: by_pose,
+        slow_jacobian=lambda: shown,
+        size_m=_size_m(raw, axes),
+        size_deg=_size_deg(raw, axes),
+    )
+
+
+def residuals(m: PoseFix, config: PoseConfig, at: Attachment) -> tuple[Residual, ...]:
+    """Return predicted - measured (k,), m and rad, for each mode."""
+    found = without_slow(m, config, at)
+    if at.slow_value is None:
+        return found
+    shown = _shown(m.axes, config)
+    found = tuple(with_slow(plain, m.axes, at.slow_value, shown, plain.jacobian()) for plain in found)
+    if at.slow_walk is None:
+        return found
+    walk = shown @ np.diag(at.slow_walk) @ shown.T
+    return tuple(_walked(residual, walk) for residual in found)
+
+
+def _walked(residual: Residual, walk: Array) -> Residual:
+    """Return a residual with what its slow error walks by between its nodes (k, k)."""
+    cov = residual.cov + walk
+    expected = float(np.trace(np.linalg.solve(cov, residual.cov)))
+    return replace(residual, cov=cov, white=residual.cov, expected_nis=expected)
+
+
+def _slow_axes(config: PoseConfig) -> tuple[str, ...]:
+    """Return the axes that have a slow error."""
+    s = config.slow_error
+    sigma = {"x": s.sigma_m, "y": s.sigma_m, "z": s.sigma_m, "yaw": s.sigma_deg}
+    return tuple(a for a in config.axes if sigma.get(a, 0.0) > 0.0)
+
+
+def _shown(axes: tuple[str, ...], config: PoseConfig) -> Array:
+    """Return d residual / d slow state (k, n)."""
+    return np.array([[float(a == b) for b in _slow_axes(config)] for a in axes])
+
+
+def slow(config: PoseConfig) -> SlowProcess | None:
+    """Return the error that poses share for a while; None if none is configured."""
+    axes, s = _slow_axes(config), config.slow_error
+    if not axes:
+        return None
+    turns = [a == "yaw" for a in axes]
+    return SlowProcess(
+        name="pose error",
+        axes=tuple({"x": "east", "y": "north", "z": "up"}.get(a, a) for a in axes),
+        units=tuple(np.where(turns, "deg", "m").tolist()),
+        scale=np.where(turns, 180.0 / np.pi, 1.0),
+        sigma=np.where(turns, np.radians(s.sigma_deg), s.sigma_m),
+        time_constant_s=np.full(len(axes), s.time_constant_s),
+    )
 
 
 def _stated(m: PoseFix) -> float:
@@ -89,8 +172,10 @@ def false(m: PoseFix, config: AnyPoseConfig) -> FalseModel:
     )
 
 
-def factors(m: PoseFix, config: AnyPoseConfig, at: Attachment, decision: Decision) -> GraphUpdate:
-    """Return the factor of the chosen mode."""
+def factors(m: PoseFix, config: AnyPoseConfig, at: Attachment, decision: Decision) -> GraphUpdate | None:
+    """Return the native factor of the chosen mode; None where a slow state adds to it."""
+    if at.slow_key is not None:
+        return None
     mode = m.modes[decision.mode]
     T_world_sensor = at.T_world_body.compose(at.T_state_sensor)
     Z = _measured_sensor_pose(mode, m.axes, T_world_sensor)
@@ -115,14 +200,26 @@ def _world_jacobian(R_world_sensor: Array, T_state_sensor: Any) -> Array:
     return np.vstack([R_world_sensor @ adjoint[3:], R_world_sensor @ adjoint[:3]])
 
 
-def ideal(at: Attachment, config: AnyPoseConfig) -> PoseFix:
-    """Return the noise-free pose at the attachment's state."""
+def ideal_without_slow(at: Attachment, config: AnyPoseConfig) -> PoseFix:
+    """Return the noise-free pose at the attachment's state, as if nothing slow were added to it."""
     T = at.T_world_body.compose(at.T_state_sensor)
     values = np.concatenate([T.translation(), T.rotation().rpy()])
     sigmas = np.where(np.arange(6) < 3, 0.3, np.radians(2.0))
     picked = [AXES.index(a) for a in config.axes]
     mode = PoseMode(value=values[picked], cov=np.diag(sigmas[picked] ** 2))
     return PoseFix(stamp_ns=0, sensor="pose", seq=0, axes=config.axes, modes=(mode,))
+
+
+def moved(ideal: PoseFix, by: Array) -> PoseFix:
+    """Return a pose of one mode, its value (k,) moved by something slow."""
+    (mode,) = ideal.modes
+    return replace(ideal, modes=(replace(mode, value=mode.value + by),))
+
+
+def ideal(at: Attachment, config: PoseConfig) -> PoseFix:
+    """Return the noise-free pose at the attachment's state."""
+    found = ideal_without_slow(at, config)
+    return found if at.slow_value is None else moved(found, _shown(found.axes, config) @ at.slow_value)
 
 
 def hint(m: PoseFix, mount_yaw_rad: float, datum: Datum) -> Hint:
@@ -150,6 +247,7 @@ ROW = Sensor(
     factors=factors,
     ideal=ideal,
     hint=hint,
+    slow=slow,
     false=false,
     scaled=scaled,
     absolute=True,

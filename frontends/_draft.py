@@ -109,6 +109,7 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
             f"  topic: {item.topic}",
             f"  # its frame '{item.frame_id}': {item.world}",
             "  enabled: false  # guess: true if its frame is east-north-up at the datum and no fix went into it",
+            "  # slow_error: {sigma_m: 1.0, time_constant_s: 60}  # where errors last (USBL, UWB, a filter's output); else they count as independent",
         ]
     in_a_grid = _in_a_grid(inspection)
     for item in (o for o in inspection.odometry if o.role == "other" and o not in in_a_grid):

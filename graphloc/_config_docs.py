@@ -17,6 +17,7 @@ from graphloc.config import (
     KernelConfig,
     LidarConfig,
     OutputConfig,
+    PoseSlowErrorConfig,
     SensorConfig,
     SlowErrorConfig,
     StartConfig,
@@ -26,8 +27,14 @@ from graphloc.config import (
 from graphloc.survey import BerthConfig, DockConfig, Survey, TagConfig
 
 _BLOCKS = (
-    DatumConfig, TimelineConfig, StartConfig, OutputConfig, MountConfig, KernelConfig, SlowErrorConfig, LidarConfig, CameraConfig,
+    DatumConfig, TimelineConfig, StartConfig, OutputConfig, MountConfig, KernelConfig, SlowErrorConfig, PoseSlowErrorConfig, LidarConfig,
+    CameraConfig,
 )  # fmt: skip
+
+_NAMES: Mapping[type[BaseModel], str] = {
+    SlowErrorConfig: "`slow_error` of kind `gnss`",
+    PoseSlowErrorConfig: "`slow_error` of kind `pose`",
+}
 
 _HEAD = (
     "Made by `graphloc config --docs`. An unknown key is an error that names the nearest known one. Each key of `sensors` "
@@ -57,7 +64,7 @@ def render(kinds: Mapping[str, type[SensorConfig]]) -> str:
         _table(VesselConfig),
     ]
     for block in _BLOCKS:
-        parts += [f"## Block `{_key(block)}`", _doc(block), "", _table(block)]
+        parts += [f"## Block {_NAMES.get(block, f'`{_key(block)}`')}", _doc(block), "", _table(block)]
     for kind, config in kinds.items():
         parts += [f"## Sensor kind `{kind}`", _doc(config), "", _table(config)]
     parts += ["# The survey: `tags.yaml`", "", _table(Survey)]
@@ -67,7 +74,7 @@ def render(kinds: Mapping[str, type[SensorConfig]]) -> str:
 
 
 def _key(block: type[BaseModel]) -> str:
-    """Name of a block as it stands in the file: `slow_error` of `SlowErrorConfig`."""
+    """Name of a block as it stands in the file: `datum` of `DatumConfig`."""
     return re.sub(r"(?<!^)(?=[A-Z])", "_", block.__name__.removesuffix("Config")).lower()
 
 

@@ -16,7 +16,15 @@ from graphloc.config._instruments import (
     SlowErrorConfig,
     VelocityConfig,
 )
-from graphloc.config._poses import AerialConfig, AnyPoseConfig, AprilTagConfig, CameraConfig, LidarConfig, PoseConfig
+from graphloc.config._poses import (
+    AerialConfig,
+    AnyPoseConfig,
+    AprilTagConfig,
+    CameraConfig,
+    LidarConfig,
+    PoseConfig,
+    PoseSlowErrorConfig,
+)
 from graphloc.config._sensor import SIGMA_SCALES, KernelConfig, SensorConfig
 from graphloc.config._vessel import DatumConfig, OutputConfig, StartConfig, TimelineConfig, VesselConfig
 
@@ -37,6 +45,7 @@ __all__ = [
     "LidarConfig",
     "OutputConfig",
     "PoseConfig",
+    "PoseSlowErrorConfig",
     "SensorConfig",
     "SlowErrorConfig",
     "StartConfig",

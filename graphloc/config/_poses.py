@@ -53,11 +53,25 @@ class AnyPoseConfig(SensorConfig):
         return "z" in self.axes
 
 
+class PoseSlowErrorConfig(Block):
+    """The slowly varying part of the error of poses: a first-order Gauss-Markov process per axis."""
+
+    sigma_m: NonNegative = 0.0
+    """Its stationary sigma, each axis of position, m; 0: there is none."""
+    sigma_deg: NonNegative = 0.0
+    """The same for yaw, deg."""
+    time_constant_s: Positive = 60.0
+    """Correlation time, s."""
+
+
 class PoseConfig(AnyPoseConfig):
     """Absolute pose in world (`geometry_msgs/PoseWithCovarianceStamped`, `nav_msgs/Odometry`)."""
 
     kind: Literal["pose"] = "pose"
     """The sensor kind."""
+    slow_error: PoseSlowErrorConfig = PoseSlowErrorConfig()
+    """An error that poses share for a while, as those of USBL, UWB or another filter's output do; estimated with the run. By default there is
+    none: errors are independent from pose to pose."""
 
 
 class LidarConfig(Block):

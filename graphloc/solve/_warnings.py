@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build import CONSTANT_TAILS, Problem, Stream, solved_constants
-from graphloc.config import SIGMA_SCALES, SensorConfig
+from graphloc.config import SIGMA_SCALES, PoseConfig, SensorConfig
 from graphloc.frames import Array
 from graphloc.graph import TIME_OFFSET, Constant, SlowProcess, corrections
 from graphloc.position_jumps import jump_warnings, largest_sigma
 from graphloc.series import runs
 from graphloc.solution import Graded, SolveStats
 from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
-from graphloc.solve._decide import AGREES
+from graphloc.solve._decide import AGREES, Verdict
 from graphloc.solve._health import CONTRADICTING_COST, FAR_OFF, late_of
 from graphloc.solve._imu_mount import MountError, mount_sigma_rad
 from graphloc.solve._imu_noise import too_quiet
+from graphloc.solve._lasting import lasting
 from graphloc.solve._passes import expected_cost
 from graphloc.time import stamps_of, utc_text
 
@@ -260,6 +261,14 @@ def _add_to(name: str, key: str, by: float, off: float) -> str:
     return f"{name}: {key} is {off:.1f} sigmas from where it is set: add {by:+.3f} to it"
 
 
+def _lasting_error(stream: Stream, verdicts: Sequence[Verdict]) -> list[str]:
+    """Return a line if poses share errors that count as independent."""
+    if not isinstance(stream.config, PoseConfig) or (found := lasting(stream, verdicts)) is None:
+        return []
+    said = f"{stream.name}: its errors last for some {found.time_s:.0f} s and count as independent, so the bounds are too small"
+    return [f"{said}: set slow_error: {{sigma_m: {found.sigma_m:.2g}, time_constant_s: {found.time_s:.0f}}}, or more"]
+
+
 def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     warnings = list[str]()
     far, said = _far_from_prior(stream, result)
@@ -280,7 +289,9 @@ def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     warnings += slow_error_warning(stream.name, stream.left_out)
     allowed = stream.left_out is not None
     warnings += jump_warnings(stream.name, *stream.position_jumps, allowed=allowed, followed=stream.slow is None)
-    weights = np.array([result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))])
+    verdicts = [result.verdicts[(stream.number, i)] for i in range(len(stream.measurements))]
+    warnings += _lasting_error(stream, verdicts)
+    weights = np.array([verdict.weight for verdict in verdicts])
     warnings += disagreement_warning(stream.name, weights)
     warnings += noisier_warning(stream.name, _noisier(stream, result))
     if stream.row.false is not None:

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors that last: positions whose residuals resemble those before them, although each counts as independent.
+
+A track that other sensors carry (wheels, a Doppler log) shows it. So far as it follows the positions, their errors are in it and not in
+their residuals: what is found is a lower limit, and nothing found no proof.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from graphloc.build import Stream
+from graphloc.frames import Array
+from graphloc.solve._decide import AGREES, Verdict
+from graphloc.time import NS_PER_S, stamps_of
+
+_FEWEST = 30
+_LEAST = 0.3  # correlation from one to the next: bounds are then a third too small, or more
+_SURE = 4.0  # sigmas of the correlation of as many independent ones
+
+
+class Lasting(NamedTuple):
+    """An error that positions share: its sigma in each axis, m, and its correlation time, s."""
+
+    sigma_m: float
+    time_s: float
+
+
+def lasting(stream: Stream, verdicts: Sequence[Verdict]) -> Lasting | None:
+    """Return the error that positions of a sensor share, clearly, though none is modelled; None if there is none.
+
+    Args:
+        verdicts: of each of its measurements.
+    """
+    used = [(m, v.residual) for m, v in zip(stream.measurements, verdicts, strict=True) if v.weight > AGREES]
+    if stream.slow is not None or stream.left_out is not None or len(used) < _FEWEST:
+        return None
+    long = [stream.row.scaled(m).get("sigma_scale", []) for m, _ in used]
+    axes = max(long, key=len)
+    kept = [k for k, own in enumerate(long) if axes and own == axes]
+    if len(kept) < _FEWEST:
+        return None
+    return lasting_error(
+        stamps_of([used[k][0] for k in kept]) / NS_PER_S, np.array([used[k][1].raw[axes] for k in kept])
+    )
+
+
+def lasting_error(t_s: Array, residuals: Array) -> Lasting | None:
+    """Return the error that residuals share with those before them, clearly; None if there is none.
+
+    Args:
+        t_s: (N,) when. residuals: (N, k), m.
+    """
+    n = len(residuals)
+    variance = float((residuals**2).mean())
+    if not variance:
+        return None
+
+    def correlation(lag: int) -> float:
+        return float((residuals[lag:] * residuals[: n - lag]).mean()) / variance
+
+    first = correlation(1)
+    if first < max(_LEAST, _SURE / np.sqrt(residuals.size)):
+        return None
+    for lag in np.unique(np.geomspace(2, n // 3, 60).astype(int)):
+        if correlation(int(lag)) < first / np.e:
+            break
+    return Lasting(float(np.sqrt(first * variance)), float(np.median(t_s[lag:] - t_s[: n - lag])))
