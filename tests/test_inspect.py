@@ -867,10 +867,12 @@ def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
         t = START_NS + k * S // 10
         items.append(("/ground_truth/odom", t, make.odometry(t, v=(1, 0, 0))))
         items.append(("/match", t, make.pose(t, (1, 2, 3))))
-    _, config, _ = look(tmp_path, items, make)
+    _, config, text = look(tmp_path, items, make)
     assert config.truth_topic is None  # no fix says where its frame lies
     assert config.check_speed_topic is None
     assert not config.sensors["pose"].enabled
+    (tmp_path / "vessel.yaml").write_text(text.replace("  # slow_error:", "  slow_error:"))
+    assert load_config(tmp_path / "vessel.yaml", KINDS).sensors["pose"].slow_error.sigma_m > 0.0  # type: ignore[attr-defined]
     (tmp_path / "b").mkdir()
     _, config, text = look(tmp_path / "b", [("/note", START_NS, make.text("hello"))], make)
     assert config.sensors == {}
