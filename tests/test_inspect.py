@@ -872,7 +872,7 @@ def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
     assert config.check_speed_topic is None
     assert not config.sensors["pose"].enabled
     (tmp_path / "vessel.yaml").write_text(text.replace("  # slow_error:", "  slow_error:"))
-    assert load_config(tmp_path / "vessel.yaml", KINDS).sensors["pose"].slow_error.sigma_m > 0.0  # type: ignore[attr-defined]
+    assert load_config(tmp_path / "vessel.yaml", KINDS).sensors["pose"].slow_error.sigma_m > 0.0
     (tmp_path / "b").mkdir()
     _, config, text = look(tmp_path / "b", [("/note", START_NS, make.text("hello"))], make)
     assert config.sensors == {}
