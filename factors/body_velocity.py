@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Velocity along the axes of the sensor: wheels, a Doppler log, a speed log.
 
-    z = (1 + s) S u + w,   u = Q^T (R^T (v + dv - c) + omega x l),   w ~ N(0, C)
+    z = (1 + s) S u + w,   u = Q^T (R^T (v + dv - c) + omega x (l + M o)),   Q = M Rz(psi),   w ~ N(0, C)
 
 v: velocity of body in world at the state; dv: its change until the measurement, by the IMU; c: the water's current, east and
 north, a first-order Gauss-Markov process (over ground: none); R: body in world; omega: body rate from the gyroscope, bias
-removed; l: sensor in body; Q: the sensor's axes in body; S: selects the measured axes; s: scale error, a constant of the run.
+removed; l, M: sensor in body; S: selects the measured axes. Constants of the run, each where it is not known: s: scale error; o: how
+far from l it sits, in axes of M (of wheels: the place that does not slip sideways); psi: by how much it is turned.
 With a = R^T (v + dv - c), the derivatives of u are Q^T R^T by v, -Q^T R^T by c, and Q^T [a]_x by the body tangent theta of
 R <- R Exp(theta): of x that is zero where u is along it, and only y tells the heading to first order. Not handled: slip of
 wheels, other than as outliers; scales that differ between axes.
@@ -13,6 +14,7 @@ wheels, other than as outliers; scales that differ between axes.
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,17 +24,19 @@ from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import BodyVelocity
 
-_CURRENT = slice(1, 3)  # after the scale error, in a slow state that has both
+_CURRENT, _OFF, _TURNED = slice(1, 3), slice(3, 6), 6  # after the scale error, in a slow state that has all
+_Z = skew(np.array([0.0, 0.0, 1.0]))
 
 
 def _there(config: BodyVelocityConfig) -> NDArray[np.bool_]:
-    """Return which of scale error, current east and current north are in the slow state (3,)."""
-    return np.array([config.scale_sigma > 0.0, *[config.through == "water"] * 2])
+    """Return which of scale error, current east and north, three axes of its place, and its yaw are in the slow state (7,)."""
+    water, place = config.through == "water", config.mount_sigma_m > 0.0
+    return np.array([config.scale_sigma > 0.0, *[water] * 2, *[place] * 3, config.mount_sigma_deg > 0.0])
 
 
 def _slow_value(at: Attachment, config: BodyVelocityConfig) -> Array:
-    """Return scale error and current (3,), m/s; zero where they are not modelled."""
-    full = np.zeros(3)
+    """Return scale error, current, m/s, how far off it sits, m, and is turned, rad, (7,); zero where they are not modelled."""
+    full = np.zeros(7)
     if at.slow_value is not None:
         full[_there(config)] = at.slow_value
     return full
@@ -40,10 +44,13 @@ def _slow_value(at: Attachment, config: BodyVelocityConfig) -> Array:
 
 def _moving(at: Attachment, config: BodyVelocityConfig) -> tuple[Array, Array, Array]:
     """Return u (3,), a (3,) and Q (3, 3), as in the module's docstring."""
-    current = np.append(_slow_value(at, config)[_CURRENT], 0.0)
+    value = _slow_value(at, config)
+    current = np.append(value[_CURRENT], 0.0)
     along = at.T_world_body.rotation().matrix().T @ (at.v_world_mps + at.dv_world_mps - current)
-    Q = at.T_state_sensor.rotation().matrix()
-    return Q.T @ (along + at.swing_mps()), along, Q
+    M = at.T_state_sensor.rotation().matrix()
+    turned = value[_TURNED]
+    Q = M if turned == 0.0 else M @ gtsam.Rot3.Rz(turned).matrix()
+    return Q.T @ (along + at.swing_mps(value[_OFF])), along, Q
 
 
 def residuals(m: BodyVelocity, config: BodyVelocityConfig, at: Attachment) -> tuple[Residual, ...]:
@@ -59,7 +66,9 @@ def residuals(m: BodyVelocity, config: BodyVelocityConfig, at: Attachment) -> tu
         return np.hstack([scale * (Q.T @ skew(along))[picked], np.zeros((len(picked), 3))])
 
     def by_slow() -> Array:
-        return np.hstack([u[picked][:, None], -by_velocity()[:, :2]])[:, _there(config)]
+        by_place = Q.T @ skew(at.gyro_radps) @ at.T_state_sensor.rotation().matrix()
+        moved = scale * np.column_stack([by_place, -_Z @ u])[picked]
+        return np.hstack([u[picked][:, None], -by_velocity()[:, :2], moved])[:, _there(config)]
 
     return (
         Residual(
@@ -76,18 +85,20 @@ def residuals(m: BodyVelocity, config: BodyVelocityConfig, at: Attachment) -> tu
 
 
 def slow(config: BodyVelocityConfig) -> SlowProcess | None:
-    """Return the process of scale error and current, as configured; None if neither is modelled."""
+    """Return the process of scale error, current, place and yaw, as configured; None if none is modelled."""
     there = _there(config)
     if not there.any():
         return None
-
+    names = ["scale", "current east", "current north", "mount x", "mount y", "mount z", "yaw"]
+    turned_rad = np.radians(config.mount_sigma_deg)
+    sigma = [config.scale_sigma, *[config.current_sigma_mps] * 2, *[config.mount_sigma_m] * 3, turned_rad]
     return SlowProcess(
         name="speed error",
-        axes=tuple(np.array(["scale", "current east", "current north"])[there].tolist()),
-        units=tuple(np.array(["%", "m/s", "m/s"])[there].tolist()),
-        scale=np.array([100.0, 1.0, 1.0])[there],
-        sigma=np.array([config.scale_sigma, config.current_sigma_mps, config.current_sigma_mps])[there],
-        time_constant_s=np.array([np.inf, config.current_time_constant_s, config.current_time_constant_s])[there],
+        axes=tuple(np.array(names)[there].tolist()),
+        units=tuple(np.array(["%", *["m/s"] * 2, *["m"] * 3, "deg"])[there].tolist()),
+        scale=np.array([100.0, *[1.0] * 5, 180.0 / np.pi])[there],
+        sigma=np.array(sigma)[there],
+        time_constant_s=np.array([np.inf, *[config.current_time_constant_s] * 2, *[np.inf] * 4])[there],
     )
 
 

@@ -19,12 +19,13 @@ RNG = np.random.default_rng(3)
 
 
 def config_of(row: Sensor) -> Any:
-    """Defaults; tags that stand in world and ride on a dock, and poses of USBL, so that they have slow states; a Doppler log in a current."""
+    """Defaults; tags that stand in world and ride on a dock, and poses of USBL, so that they have slow states; a Doppler log in a current, its mount unknown."""
     if row.kind == "pose":
         axes, slow_error = ["x", "y", "z", "yaw"], {"sigma_m": 1.0, "sigma_deg": 2.0}
         return row.config.model_validate({"kind": row.kind, "axes": axes, "slow_error": slow_error})
     if row.kind == "body_velocity":
-        return row.config.model_validate({"kind": row.kind, "axes": ["x", "y", "z"], "through": "water"})
+        unknown = {"mount_sigma_m": 1.0, "mount_sigma_deg": 2.0}
+        return row.config.model_validate({"kind": row.kind, "axes": ["x", "y", "z"], "through": "water", **unknown})
     if row.kind != "apriltag":
         return row.config(kind=row.kind)
     tags = [

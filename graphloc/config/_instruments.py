@@ -225,6 +225,11 @@ class BodyVelocityConfig(SensorConfig):
     """Floor of the sigma, m/s: wheels slip and water eddies for longer than a message, and drivers claim too little."""
     scale_sigma: Annotated[float, Field(ge=0.0, le=0.5)] = 0.05
     """Unknown but constant error of the scale (radius of a wheel, calibration of a log), 1 sigma, as a share; 0: exact."""
+    mount_sigma_m: NonNegative = 0.0
+    """Unknown error of where it is taken to sit (`mount.xyz_m`, or tf), 1 sigma, each axis, m; it is estimated with the run. Of wheels, of
+    the place that does not slip sideways, which turns tell. 0: the place is known."""
+    mount_sigma_deg: NonNegative = 0.0
+    """Unknown error of the yaw of its mount, 1 sigma, deg; it is estimated with the run. Of wheels, of the way that they roll. 0: known."""
     current_sigma_mps: Positive = 0.5
     """Standing size of the current, each of east and north, 1 sigma, m/s."""
     current_time_constant_s: Positive = 600.0
