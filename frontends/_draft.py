@@ -463,6 +463,12 @@ def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:
     ]  # fmt: skip
 
 
+_UNKNOWN_MOUNT = (
+    "  mount_sigma_m: 1.5  # guess: how far from the mount the place is that does not slip sideways (a car's rear axle); estimated with the run",
+    "  mount_sigma_deg: 1.0  # guess: how far the way they roll is turned; estimated with the run",
+)
+
+
 def _wheels_block(name: str, item: OdometryReport) -> list[str]:
     turned = ["  mount: {rpy_deg: [0.0, 0.0, 180.0]}  # guess: its sign looks wrong"] if item.reverse else []
     return [
@@ -470,6 +476,7 @@ def _wheels_block(name: str, item: OdometryReport) -> list[str]:
         "  enabled: false  # guess: true to fuse it, if held-out fixes are predicted no worse (fix_rmse_m); then delete check_speed_topic",
         "  axes: [x, y]  # guess: wheels do not slip sideways; x alone tells the heading by its cosine only, and may not converge",
         *turned,
+        *_UNKNOWN_MOUNT,
     ]  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from graphloc import app
 from graphloc.blocks import MountConfig
@@ -162,6 +163,33 @@ def test_the_batch_finds_the_current() -> None:
     used = [row for row in solution.ledger if row.sensor == "log"]
     assert len(used) == sum(isinstance(m, BodyVelocity) for m in run.recording.measurements)
     assert sum(row.outcome is Outcome.USED for row in used) > 0.9 * len(used)
+
+
+def test_the_batch_finds_where_wheels_sit_and_how_they_are_turned() -> None:
+    """A place 1.2 m abaft of where it is taken to be and turned by 2 deg; its velocity by differences of its true positions."""
+    scenario = Scenario(path="loops", duration_s=120.0, gnss_hz=2.0, pose_hz=0.0, log_hz=5.0, log_through="ground")
+    run = simulate_slowly(scenario, 3)
+    truth, rng = run.truth, np.random.default_rng(8)
+    place = truth.p_world_m + truth.R_world_body @ np.array([-1.2, 0.0, 0.0])
+    t_s = 1e-9 * (truth.stamps_ns - truth.stamps_ns[0])
+    turned = Rotation.from_euler("z", 2.0, degrees=True).as_matrix()
+    along = np.einsum("nji,nj->ni", truth.R_world_body @ turned, np.gradient(place, t_s, axis=0))
+
+    def rolled(m: Any) -> Any:
+        if not isinstance(m, BodyVelocity):
+            return m
+        k = int(np.searchsorted(truth.stamps_ns, m.stamp_ns))
+        return replace(m, axes=("x", "y"), value=along[k, :2] + rng.normal(0.0, 0.05, 2), cov=0.05**2 * np.eye(2))
+
+    block = configured(topic="/log", axes=["x", "y"], mount_sigma_m=1.5, mount_sigma_deg=2.0)
+    config = run.config.model_copy(update={"sensors": {**run.config.sensors, "log": block}})
+    found = app.simulated(replace(run, recording=run.recording.changed(rolled), config=config), compare=False).solution
+    slow = found.slow["log"]
+    assert slow.axes == ("scale", "mount x", "mount y", "mount z", "yaw")
+    away = (slow.value[-1] - [0.0, -1.2, 0.0, 0.0, 2.0]) / slow.sigma[-1]
+    assert np.abs(away).max() < 3.0
+    assert slow.sigma[-1][1] < 0.3  # m, of 1.5 to begin with
+    assert slow.sigma[-1][4] < 1.0  # deg, of 2
 
 
 def test_the_better_filter_takes_it_and_the_thesis_says_why_not() -> None:
