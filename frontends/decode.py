@@ -295,7 +295,7 @@ def _placed(
         cov = cov.copy()
         cov[2, :] = cov[:, 2] = 0.0  # what the message claims of a height that it does not give
         default[2] = NO_HEIGHT_M2
-    if config.fixes != "any":
+    if config.takes_turns:
         variance = np.diagonal(cov)[:2]
         known = np.isfinite(variance).all() and bool((variance > 0.0).all())
         rtk = status >= _MIN_STATUS["gbas"] and known and float(variance.max()) < RTK_SIGMA_M**2

@@ -159,8 +159,7 @@ def _slow_and_jumps(
     slow, left_out = slow_or_left_out(row, config, company)
     jumps = _NO_JUMPS
     # What a receiver says with and without RTK is told apart by its slow errors, but neither holds the place while the other jumps.
-    by_turns = getattr(config, "fixes", "any") != "any"
-    if alone and (slow is None or by_turns) and row.absolute and row.false is None:
+    if alone and (slow is None or config.takes_turns) and row.absolute and row.false is None:
         jumps = _position_jumps(row, measurements, datum, allowed_jump_m(left_out or slow))
     if left_out is not None and len(jumps[0]):
         slow, left_out = without_drift(left_out), None

@@ -155,6 +155,11 @@ class GnssConfig(SensorConfig):
         """Its fixes do."""
         return True
 
+    @property
+    def takes_turns(self) -> bool:
+        """It does where the other fixes are another sensor's."""
+        return self.fixes != "any"
+
 
 class CompassConfig(SensorConfig):
     """Heading: `geometry_msgs/QuaternionStamped`, orientation of `sensor_msgs/Imu`, NMEA (as `gnss`), `std_msgs/Float64` or `Float32`."""
