@@ -166,6 +166,10 @@ class VesselConfig(Block):
         others = {n: s for n, s in self.of_kind(own.kind).items() if n != name and s.takes_turns}
         return [name, *(n for n, s in others.items() if (s.topic, s.nmea) == (own.topic, own.nmea))]
 
+    def receiver_of(self, name: str) -> str:
+        """Return the name that stands for all sensors that read one receiver's fixes by turns: that of the first."""
+        return min(self.by_turns(name), key=list(self.sensors).index)
+
     def of_kind(self, kind: str) -> dict[str, Any]:
         """Return the enabled sensors of a kind, by name."""
         return {n: s for n, s in self.sensors.items() if s.kind == kind and s.enabled}
