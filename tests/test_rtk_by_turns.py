@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """A receiver whose RTK comes and goes: centimetres while it is there, honest bounds while it is not, and nothing missing."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from graphloc import app
+from graphloc.build import shared_constants
 from graphloc.config import GnssConfig, SlowErrorConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, Geodetic
@@ -16,7 +20,9 @@ from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Recording
 from graphloc.solution import Cause, Health, Solution
 from graphloc.trajectory import bounds_95
+from tests.faults import arrivals_of, feed
 from tests.slowly import with_few_states
+from tests.test_online_faults import smoother
 
 RTK_S, OTHER_S, SIGMA_M = 14.0, 16.0, {True: 0.02, False: 1.0}
 TRACK = Scenario(path="loops", duration_s=105.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, pose_hz=0.0)
@@ -100,3 +106,55 @@ def test_a_wrong_rtk_fix_is_not_followed(solve: Callable[[Recording, VesselConfi
     assert np.sqrt(np.mean(off_m[jumped] ** 2)) < 1.0
     assert np.mean(off_m < bounds_95(np.asarray(solution.trajectory.cov))[:, 0]) > 0.9
     assert any("gnss: position jump" in line for line in (*solution.stats.warnings, *solution.stats.events))
+
+
+def elsewhere(run: SimulatedRun, **gnss: Any) -> SimulatedRun:
+    """Its antenna is taken to sit 1 m ahead of where it does, which is to be found with the run."""
+    receivers = run.config.of_kind("gnss")
+    mount = receivers["gnss"].mount.model_copy(update={"xyz_m": (1.0, 0.0, 0.0)})
+    unknown = {"mount": mount, "mount_sigma_m": 1.0, "stamp_sigma_s": 0.05, **gnss}
+    changed = {name: block.model_copy(update=unknown) for name, block in receivers.items()}
+    return replace(run, config=run.config.with_sensors(changed))
+
+
+@pytest.mark.parametrize("solve", [app.smooth_recording, app.replay_recording], ids=["offline", "online"])
+def test_it_has_one_antenna_and_one_clock(solve: Callable[[Recording, VesselConfig], app.Run]) -> None:
+    """Found by what tells it, the fixes of RTK, it is known of the others as well; and it is said once."""
+    _, two = receiver(comes_and_goes, lambda t: (0.0, 0.0) if comes_and_goes(t) else (2.0, -1.0))
+    run = solve(two.recording, elsewhere(two, mount_sigma_m=0.25).config)
+    found = run.solution
+    off_m, other_m = (found.antennas_off_m[name] for name in ("gnss", "gnss_other"))
+    assert off_m[0] == pytest.approx(-1.0, abs=0.2)
+    np.testing.assert_array_equal(other_m, off_m)
+    lines = [w for w in (*found.stats.warnings, *found.stats.events) if "mount.xyz_m[0]" in w]
+    assert len({line.partition("gnss")[2] for line in lines}) == 1, lines
+    if run.calibration is not None:
+        keys = [c.key for c in run.calibration.checks] + [s.key for s in run.calibration.suggestions]
+        of = {key.split(".")[1] for key in keys}
+        assert "gnss" in of
+        assert "gnss_other" not in of
+        (said,) = (s for s in run.calibration.suggestions if s.key == "sensors.gnss.mount.xyz_m[0]")
+        assert "also of gnss_other" in said.action
+
+
+def test_parts_that_are_set_otherwise_have_constants_of_their_own() -> None:
+    _, two = receiver(comes_and_goes, lambda _t: (0.0, 0.0))
+    config = elsewhere(two).config
+    assert shared_constants("gnss_other", config) == list(config.sensors).index("gnss")
+    assert shared_constants("gnss", config) is None
+    measured = config.sensors["gnss"].model_copy(update={"mount_sigma_m": 0.0})
+    assert shared_constants("gnss_other", config.with_sensors({"gnss": measured})) is None
+
+
+def test_online_resumes_with_its_one_antenna(tmp_path: Path) -> None:
+    """What is known of it stands once in the snapshot, and holds for both."""
+    _, two = receiver(comes_and_goes, lambda t: (0.0, 0.0) if comes_and_goes(t) else (2.0, -1.0))
+    config = elsewhere(two).config
+    run = replace(two, config=config)
+    came, path = arrivals_of(run), tmp_path / "snapshot.json"
+    known, events = list[Any](), list[str]()
+    for part in np.array_split(np.arange(len(came)), 2):
+        events += feed(smoother(run, snapshot=path), run, came[part[0] : part[-1] + 1]).events
+        known += [(name, number) for name, number, _ in json.loads(path.read_text())["anchor"]["constants"]]
+    assert known == [("gnss", 0)] * 2
+    assert any(event.startswith("resumed from a snapshot") for event in events)
