@@ -14,12 +14,18 @@ import pytest
 from graphloc import app
 from graphloc.build import shared_constants
 from graphloc.config import GnssConfig, SlowErrorConfig, VesselConfig
+from graphloc.eval.drill import script
+from graphloc.eval.ekf import run_honest
+from graphloc.eval.holdout import HoldOut, telling
+from graphloc.eval.report import Trust, verdict
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, Geodetic
+from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Recording
 from graphloc.solution import Cause, Health, Solution
 from graphloc.trajectory import bounds_95
+from tests.bagfactory import S
 from tests.faults import arrivals_of, feed
 from tests.slowly import with_few_states
 from tests.test_online_faults import smoother
@@ -108,6 +114,43 @@ def test_a_wrong_rtk_fix_is_not_followed(solve: Callable[[Recording, VesselConfi
     assert any("gnss: position jump" in line for line in (*solution.stats.warnings, *solution.stats.events))
 
 
+def test_held_out_fixes_without_rtk_measure_nothing() -> None:
+    """They are kept out as well, else the track would know what it is to predict; off by metres, they were all of its error."""
+    _, two = receiver(comes_and_goes, lambda t: (0.0, 0.0) if comes_and_goes(t) else (1.5, -1.5))
+    found = app.smooth_recording(replace(two.recording, truth=None), two.config, hold_out=HoldOut(every=5))
+    held = [row.sensor for row in found.recording.rows if row.outcome is Outcome.HELD_OUT]
+    assert set(held) == {"gnss", "gnss_other"}
+    assert {m.sensor for m in found.held} == {"gnss"}
+    assert len(found.held) == held.count("gnss")
+    assert f"Another {held.count('gnss_other')} without RTK were kept out" in app.report_data(found).truth_statement
+    without = two.recording.where(lambda m: m.sensor != "gnss")
+    _, left = HoldOut(every=5).split(without)
+    assert telling(left, two.config) == left  # where there is nothing better
+
+
+def test_a_receiver_that_hangs_repeats_what_it_said_last_with_rtk_or_without() -> None:
+    _, two = receiver(comes_and_goes, lambda _t: (0.0, 0.0))
+    begin_ns = int(two.truth.stamps_ns[0]) + 40 * S  # since 30 s it has RTK
+    hangs = next(f for f in script(two.recording, two.config)[0] if f.name == "GNSS frozen, 30 s")
+    during = [
+        m
+        for m in hangs.on(two.recording, begin_ns, 0).recording.of(GnssPosition)
+        if 0 <= m.stamp_ns - begin_ns < 30 * S
+    ]
+    assert len(during) > 50
+    assert len({(m.sensor, m.position) for m in during}) == 1
+    assert during[0].sensor == "gnss"
+
+
+def test_it_is_one_receiver_to_a_filter() -> None:
+    """Its slow error is shared by all fixes of a second, and after ten seconds of refusals any is taken."""
+    one, two = receiver(comes_and_goes, lambda t: (0.0, 0.0) if comes_and_goes(t) else (4.0, 0.0))
+    datum = app.choose_datum(one.recording, one.config)
+    tracks = [run_honest(run.recording, run.config, datum).trajectory for run in (one, two)]
+    np.testing.assert_array_equal(tracks[1].p_world_m, tracks[0].p_world_m)
+    np.testing.assert_array_equal(tracks[1].cov, tracks[0].cov)
+
+
 def elsewhere(run: SimulatedRun, **gnss: Any) -> SimulatedRun:
     """Its antenna is taken to sit 1 m ahead of where it does, which is to be found with the run."""
     receivers = run.config.of_kind("gnss")
@@ -128,6 +171,10 @@ def test_it_has_one_antenna_and_one_clock(solve: Callable[[Recording, VesselConf
     np.testing.assert_array_equal(other_m, off_m)
     lines = [w for w in (*found.stats.warnings, *found.stats.events) if "mount.xyz_m[0]" in w]
     assert len({line.partition("gnss")[2] for line in lines}) == 1, lines
+    unmeasured = replace(run, recording=replace(run.recording, truth=None))
+    reasons = verdict(app.report_data(unmeasured)).reasons
+    told = [reason.text for reason in reasons if "Where the antenna of" in reason.text]
+    assert len(told) == (1 if found.stats.online else 0)
     if run.calibration is not None:
         keys = [c.key for c in run.calibration.checks] + [s.key for s in run.calibration.suggestions]
         of = {key.split(".")[1] for key in keys}
@@ -158,3 +205,21 @@ def test_online_resumes_with_its_one_antenna(tmp_path: Path) -> None:
         known += [(name, number) for name, number, _ in json.loads(path.read_text())["anchor"]["constants"]]
     assert known == [("gnss", 0)] * 2
     assert any(event.startswith("resumed from a snapshot") for event in events)
+
+
+def test_one_receiver_is_one_witness_against_another() -> None:
+    """Which of two receivers is wrong is not told by one of them because it has RTK at times."""
+    _, two = receiver(comes_and_goes, lambda _t: (0.0, 0.0))
+    run = app.smooth_recording(two.recording, two.config)
+    far = [
+        replace(
+            m, sensor="stern", seq=90_000 + k, position=m.position._replace(latitude_deg=m.position.latitude_deg + 1e-3)
+        )
+        for k, m in enumerate(two.recording.of(GnssPosition, "gnss"))
+    ]
+    stern = two.config.sensors["gnss"].model_copy(update={"fixes": "any", "topic": "/stern"})
+    recording = replace(two.recording, measurements=(*two.recording.measurements, *far))
+    beside = replace(run, recording=recording, config=two.config.with_sensors({"stern": stern}))
+    (said,) = (reason for reason in verdict(app.report_data(beside)).reasons if "of stern" in reason.text)
+    assert said.trust is Trust.NO
+    assert "this run does not tell which" in said.text

@@ -79,6 +79,7 @@ def smooth_recording(
     held: tuple[GnssPosition, ...] = ()
     if hold_out is not None:
         recording, held = hold_out.split(recording)
+        held = holdout.telling(held, config)
     datum = choose_datum(recording, config)
     recording = with_synthetic(recording, config, datum)
     matched = scans is not None and bool(config.of_kind("aerial"))
