@@ -20,6 +20,7 @@ from graphloc.eval.holdout import HoldOut, telling
 from graphloc.eval.report import Trust, verdict
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, Geodetic
+from graphloc.frozen_receiver import FROZEN
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Recording
@@ -130,7 +131,7 @@ def test_held_out_fixes_without_rtk_measure_nothing() -> None:
 
 def test_a_receiver_that_hangs_repeats_what_it_said_last_with_rtk_or_without() -> None:
     _, two = receiver(comes_and_goes, lambda _t: (0.0, 0.0))
-    begin_ns = int(two.truth.stamps_ns[0]) + 40 * S  # since 30 s it has RTK
+    begin_ns = int(two.truth.stamps_ns[0]) + 44 * S  # RTK until then, and none when it speaks again
     hangs = next(f for f in script(two.recording, two.config)[0] if f.name == "GNSS frozen, 30 s")
     during = [
         m
@@ -140,6 +141,12 @@ def test_a_receiver_that_hangs_repeats_what_it_said_last_with_rtk_or_without() -
     assert len(during) > 50
     assert len({(m.sensor, m.position) for m in during}) == 1
     assert during[0].sensor == "gnss"
+    solution = app.solve(
+        hangs.on(two.recording, begin_ns, 0).recording, two.config, app.choose_datum(two.recording, two.config)
+    )
+    frozen = [row for row in solution.ledger if row.reason.startswith(FROZEN)]
+    assert len(frozen) == len(during)  # the next fix, which shows it, is without RTK
+    assert any(line.startswith("gnss: for ") and FROZEN in line for line in solution.stats.warnings)
 
 
 def test_it_is_one_receiver_to_a_filter() -> None:
