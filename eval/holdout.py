@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 
+from graphloc.config import VesselConfig
 from graphloc.errors import ConfigError
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition
@@ -23,6 +24,17 @@ def suggested(fixes: Sequence[GnssPosition]) -> str | None:
         return None
     gaps = int(((fixes[-1].stamp_ns - fixes[0].stamp_ns) * 1e-9 / _GAP_S - 1.0) / 2.0)
     return f"gaps:{min(gaps, _MOST_GAPS)}x{_GAP_S}" if gaps > 0 else "every:5"
+
+
+def telling(held: Sequence[GnssPosition], config: VesselConfig) -> tuple[GnssPosition, ...]:
+    """Return the held-out fixes that a track is measured by: of a receiver whose RTK comes and goes those of RTK, where there are some.
+
+    The others are off by metres themselves, which would be all that is seen.
+    """
+    rtk = {m.sensor for m in held if config.sensors[m.sensor].fixes == "rtk"}
+    worse = {m.sensor for m in held if config.sensors[m.sensor].fixes == "other"}
+    worse = {name for name in worse if rtk.intersection(config.by_turns(name))}
+    return tuple(m for m in held if m.sensor not in worse)
 
 
 @dataclass(frozen=True, slots=True)

@@ -225,20 +225,29 @@ def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> M
 
 
 def _by_turns(
-    stamps_ns: NDArray[np.int64], p_m: Array, rows: Array, sigmas_m: Array, fixed: NDArray[np.bool_]
+    stamps_ns: NDArray[np.int64],
+    p_m: Array,
+    rows: Array,
+    known: NDArray[np.bool_],
+    sigmas_m: Array,
+    fixed: NDArray[np.bool_],
 ) -> tuple[PartOfFixes, PartOfFixes] | None:
-    """Return the fixes (N,) of RTK, and the others, where a receiver has both; `rows`: of each, `sigmas_m`: what it states, horizontally."""
+    """Return the fixes (N,) of RTK, and the others, where a receiver has both.
+
+    Args:
+        rows: (N, 8) of each. known: whether it states its noise. sigmas_m: which, horizontally. fixed: whether it is of RTK.
+    """
     if not _EITHER <= fixed.mean() <= 1.0 - _EITHER:
         return None
 
     def part(of: NDArray[np.bool_]) -> PartOfFixes:
-        known = of & (rows[:, 4] > 0) & (rows[:, 5:8] > 0.0).all(axis=1)
+        told = of & known
         # A float's error is as large as it claims; what is no RTK at all claims more for its white noise, or too little.
         default_m = SlowErrorConfig().horizontal_sigma_m
         slow_m = np.where(rows[of, 3] >= 2.0, np.minimum(sigmas_m[of], default_m), default_m)
         return PartOfFixes(
             share=float(of.mean()),
-            sigma_m=vec(np.sqrt(np.median(rows[known, 5:8], axis=0))) if known.any() else None,
+            sigma_m=vec(np.sqrt(np.median(rows[told, 5:8], axis=0))) if told.any() else None,
             white_m=scatter_m(stamps_ns[of], p_m[of, :2]),
             slow_m=float(np.percentile(slow_m, 95)),
         )
@@ -290,7 +299,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         frozen="".join(frozen_fixes_warning(fixes.topic, stamps, bad)),
         stored="".join(stored_warning(fixes.topic, places[:, :3], old)),
         slow_error=not precise,
-        by_turns=_by_turns(stamps[~bad], own, rows[~bad], sigmas[~bad], fixed[~bad]),
+        by_turns=_by_turns(stamps[~bad], own, rows[~bad], known[~bad], sigmas[~bad], fixed[~bad]),
         why=why,
         tf_frame=tf_frame,
     )

@@ -21,6 +21,7 @@ from graphloc.frontends._sanity import (
     HALF,
     NEVER_STILL_RADPS,
     missing_half,
+    no_gravity_in_si,
     saturation_warning,
     size_at_ease,
     turns_gravity,
@@ -365,7 +366,7 @@ def _units_of(stamps: NDArray[np.int64], accel: Array, gyro: Array) -> _Units:
         why.append(f"median acceleration is {size:.2f}: looks like g")
     if gravity == "removed":
         why.append(f"median acceleration is {size:.2f}: looks like gravity was removed by the driver")
-    if accel_unit == "m/s^2" and gravity == "included" and (size < 8.5 or (size > 11.5 and at_ease)):
+    if accel_unit == "m/s^2" and gravity == "included" and no_gravity_in_si(size, at_ease):
         why.append(f"median acceleration is {size:.2f}: neither m/s^2 nor g with gravity; check the sensor")
     if gyro_unit == "deg/s":
         why.append(f"median rate is {rate:.2f}: too much for rad/s, looks like deg/s")

@@ -268,10 +268,8 @@ def reject_repeats(readings: Readings) -> list[LedgerRow]:
 
 def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     """Drop fixes that a driver only repeats; warn of that, of truncated or uneven stamps, and of claimed noise that is far too small."""
-    by_turns = (
-        isinstance(readings.config, GnssConfig) and readings.config.fixes != "any"
-    )  # its gaps are another sensor's fixes
-    if not by_turns and isinstance(readings.config, (GnssConfig, CompassConfig, VelocityConfig, BodyVelocityConfig)):
+    told = isinstance(readings.config, (GnssConfig, CompassConfig, VelocityConfig, BodyVelocityConfig))
+    if told and not readings.config.takes_turns:  # else its gaps are another sensor's fixes
         warnings += _fixes.stamp_warning(readings.sensor, readings.stamps())
     if not isinstance(readings.config, GnssConfig):
         return []

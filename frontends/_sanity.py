@@ -28,10 +28,9 @@ _GRAVITY_S, _FEWEST_WINDOWS = 0.4, 10  # windows whose mean acceleration tells w
 _LEAST_RANGE_MPS2, _LEAST_RANGE_RADPS = 19.0, 1.7  # no IMU has less (2 g, 100 deg/s)
 # Readings at the end of the range that are no chance; the band beneath it (a share of it), in which fewer lie.
 _CUT, _BENEATH = 5, 0.03
-_LEAST_TURNING, _AT_EASE_RADPS = (
-    0.3,
-    0.3,
-)  # share of the samples, which turn least; what they turn by at most where turns are no matter
+# Share of the samples, which turn least; what they turn by at most where turns are no matter.
+_LEAST_TURNING, _AT_EASE_RADPS = 0.3, 0.3
+_LEAST_GRAVITY_MPS2, _MOST_GRAVITY_MPS2 = 8.5, 11.5  # between which a median acceleration may be gravity
 _EXPLAINED = 0.75  # of what its direction moves by, that rates in rad/s leave at most
 
 
@@ -56,6 +55,11 @@ def size_at_ease(accel: Array, gyro_radps: Array) -> tuple[float, bool]:
     rates = np.linalg.norm(gyro_radps, axis=1)
     least = float(np.quantile(rates, _LEAST_TURNING))
     return float(np.median(np.linalg.norm(accel[rates <= least], axis=1))), least < _AT_EASE_RADPS
+
+
+def no_gravity_in_si(size: float, at_ease: bool) -> bool:
+    """Return whether accelerations are too small or too large to be gravity in m/s^2; `size` (in their unit), `at_ease`: see `size_at_ease`."""
+    return size < _LEAST_GRAVITY_MPS2 or (size > _MOST_GRAVITY_MPS2 and at_ease)
 
 
 def without_gravity(accel: Array) -> bool:
@@ -96,7 +100,7 @@ def imu_warnings(
     rate = float(np.median(np.linalg.norm(gyro_radps, axis=1)))
     lines = []
     said = f"{sensor}: median acceleration is {g:.2f} m/s^2"
-    if config.gravity != "removed" and (g < 8.5 or (g > 11.5 and at_ease)):
+    if config.gravity != "removed" and no_gravity_in_si(g, at_ease):
         if g < 2.0:
             lines.append(f"{said}: looks like gravity was removed by the driver; set gravity: removed")
         else:

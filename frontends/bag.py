@@ -115,7 +115,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
     if imu is not None:
         _refuse_unit(imu, sensors)
         warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, sensors, mounts, config)
-    warnings += _silent(sensors, rows, topics) + _unstamped(sensors, topics) + _heightless(sensors, config)
+    warnings += _silent(sensors, rows, topics, config) + _unstamped(sensors, topics) + _heightless(sensors, config)
     warnings += [
         f"{b.topic}: {b.unstamped} of its headers hold no stamp: recording times are used"
         for b in (truth, check)
@@ -378,10 +378,13 @@ def _heightless(sensors: Sequence[Readings], config: VesselConfig) -> list[str]:
     ]
 
 
-def _silent(sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapping[str, TopicSummary]) -> list[str]:
-    """Return a line for each sensor without a reading, with the main reason."""
+def _silent(
+    sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapping[str, TopicSummary], config: VesselConfig
+) -> list[str]:
+    """Return a line for each sensor without a reading, with the main reason; of those that read a receiver by turns one may lack any."""
     lines = []
-    for readings in (r for r in sensors if not r.values):
+    heard = {config.receiver_of(r.sensor) for r in sensors if r.values}
+    for readings in (r for r in sensors if config.receiver_of(r.sensor) not in heard):
         own = [r for r in rows if r.sensor == readings.sensor]
         # Of a line of NMEA most is for others, which is no reason.
         reasons = Counter(r.reason for r in own if r.outcome is not Outcome.IGNORED) or Counter(r.reason for r in own)

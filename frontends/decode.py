@@ -295,10 +295,8 @@ def _placed(
         cov = cov.copy()
         cov[2, :] = cov[:, 2] = 0.0  # what the message claims of a height that it does not give
         default[2] = NO_HEIGHT_M2
-    if config.fixes != "any":
-        variance = np.diagonal(cov)[:2]
-        known = np.isfinite(variance).all() and bool((variance > 0.0).all())
-        rtk = status >= _MIN_STATUS["gbas"] and known and float(variance.max()) < RTK_SIGMA_M**2
+    if config.takes_turns:
+        rtk = is_rtk(status, cov)
         if rtk != (config.fixes == "rtk"):
             return ignored(
                 f"{'of RTK' if rtk else 'without RTK'}, by its status and what it states, and fixes is {config.fixes}"
@@ -310,6 +308,13 @@ def _placed(
         position=Geodetic(lat, lon, height),
         cov_enu_m2=usable_covariance(cov, default),
     )
+
+
+def is_rtk(status: int, cov: Array) -> bool:
+    """Return whether a fix is of RTK: by its `NavSatStatus`, and its covariance (3, 3), m^2 (zeros or NaN: unknown)."""
+    variance = np.diagonal(cov)[:2]
+    known = bool(np.isfinite(variance).all() and (variance > 0.0).all())
+    return status >= _MIN_STATUS["gbas"] and known and float(variance.max()) < RTK_SIGMA_M**2
 
 
 def _heading(orientation: Any, variance: float, stamp_ns: int, seq: int, sensor: str, config: CompassConfig) -> Decoded:

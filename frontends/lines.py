@@ -32,7 +32,7 @@ from graphloc.config import (
 )
 from graphloc.frames import Array, wrap_angle, yaw_from_heading_deg
 from graphloc.frontends._rejections import Rejection, malformed
-from graphloc.frontends.decode import DECODERS, NAV_SAT_FIX, POSE, TWIST
+from graphloc.frontends.decode import DECODERS, NAV_SAT_FIX, POSE, TWIST, is_rtk
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import CompassHeading, ImuSample, Measurement, PoseFix, PoseMode
 from graphloc.time import NS_PER_S, duration_ns
@@ -117,9 +117,10 @@ class _Line(_Stamped):
             )
         if self.sensor and self.sensor not in enabled:
             return Rejection(Outcome.IGNORED, "switched off in vessel.yaml")
-        if not self.sensor and len(enabled) != 1:
+        receivers = list(dict.fromkeys(map(config.receiver_of, enabled)))
+        if not self.sensor and len(receivers) != 1:
             return malformed(f"'sensor' is missing: vessel.yaml has {len(enabled)} enabled sensors of kind {self.kind}")
-        return self.sensor or enabled[0]
+        return self.sensor or receivers[0]
 
 
 class ImuLine(_Line):
@@ -149,11 +150,23 @@ class GnssLine(_Line):
     cov_enu_m2: Matrix3 | None = None
     status: Literal["none", "fix", "sbas", "gbas"] = "fix"
 
+    def sensor_in(self, config: VesselConfig) -> str | Rejection:
+        """Return the name of the sensor: of those that read one receiver's fixes by turns the one that reads this fix."""
+        named = super().sensor_in(config)
+        if isinstance(named, Rejection) or not config.sensors[named].takes_turns:
+            return named
+        read = "rtk" if is_rtk(_STATUS[self.status], self._cov()) else "other"
+        readers = [name for name in config.by_turns(named) if config.sensors[name].fixes == read]
+        return readers[0] if len(readers) == 1 else named  # of several receivers without a topic, as it says
+
+    def _cov(self) -> Array:
+        return _covariance(self.cov_enu_m2, self.sigma_m or _ZERO)
+
     def measured(self, at: _At, config: GnssConfig) -> Measurement | Rejection:
         """Return the fix, or its rejection."""
         fix = SimpleNamespace(
             status=SimpleNamespace(status=_STATUS[self.status]), latitude=self.lat_deg, longitude=self.lon_deg,
-            altitude=math.nan if self.height_m is None else self.height_m, position_covariance=_covariance(self.cov_enu_m2, self.sigma_m or _ZERO),
+            altitude=math.nan if self.height_m is None else self.height_m, position_covariance=self._cov(),
             position_covariance_type=_KNOWN if self.cov_enu_m2 or self.sigma_m else _UNKNOWN,
         )  # fmt: skip
         return _decoded(NAV_SAT_FIX, fix, at, config)

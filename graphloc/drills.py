@@ -63,7 +63,7 @@ def drill(
     """
     _refuse_unknown(recording, only)
     run = app.smooth_recording(recording, config, scans=scans, progress=progress)
-    failures, left = script(run.recording)
+    failures, left = script(run.recording, config)
     failures = _wanted(failures, only)
     parts = windows(run.recording, max(f.length_s for f in failures), times)
     bench = _Bench(run, parts, jobs, progress)

@@ -10,8 +10,10 @@ can brake. Online: `online/_frozen_receiver.py`, `online/_repeated_fix.py`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
+from types import MappingProxyType
 from typing import TypeVar
 
 import numpy as np
@@ -242,8 +244,15 @@ def frozen_fixes_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray
     return [f"{sensor}: for {stretches(stamps_ns, bad)} {WHY}; {int(bad.sum())} fixes rejected"]
 
 
-def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording, list[str]]:
-    """Return a recording without what frozen receivers repeat (it gets ledger rows), and a warning on each such receiver."""
+def without_frozen_fixes(
+    recording: Recording, datum: Datum, receivers: Mapping[str, str] = MappingProxyType({})
+) -> tuple[Recording, list[str]]:
+    """Return a recording without what frozen receivers repeat (it gets ledger rows), and a warning on each such receiver.
+
+    Args:
+        receivers: by sensor, what stands for those that read one receiver's fixes by turns (`VesselConfig.receiver_of`): after it hung
+            with RTK, the next fix may be without.
+    """
     gone: dict[int, str] = {}
     said = []
     # First and last stamps of velocities that are repeated, of a vessel under way.
@@ -258,7 +267,7 @@ def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording,
             said.append(
                 f"{sensor}: for {stretches(stamps_ns, bad)} {WHY_VELOCITY}; {int(bad.sum())} velocities rejected"
             )
-    for sensor, fixes in _by_sensor(recording, GnssPosition).items():
+    for sensor, fixes in _by_sensor(recording, GnssPosition, receivers).items():
         stamps_ns, lat_lon = stamps_of(fixes), np.array([m.position[:2] for m in fixes])
         bad = frozen_fixes(stamps_ns, lat_lon, world_from_fixes(fixes, datum)[:, :2])
         # One receiver, or its driver, says both.
@@ -273,8 +282,10 @@ def without_frozen_fixes(recording: Recording, datum: Datum) -> tuple[Recording,
     return replace(left, rows=(*recording.rows, *rows)), said
 
 
-def _by_sensor(recording: Recording, kind: type[_M]) -> dict[str, list[_M]]:
+def _by_sensor(
+    recording: Recording, kind: type[_M], receivers: Mapping[str, str] = MappingProxyType({})
+) -> dict[str, list[_M]]:
     found: dict[str, list[_M]] = {}
     for m in recording.of(kind):
-        found.setdefault(m.sensor, []).append(m)
+        found.setdefault(receivers.get(m.sensor, m.sensor), []).append(m)
     return found

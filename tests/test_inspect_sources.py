@@ -625,6 +625,20 @@ def test_rtk_that_is_float_at_times_is_two_sensors(floats: float, tmp_path: Path
     assert left == Counter({(name, Outcome.IGNORED): len(fixes) - len(used[name]) for name in found} if floats else {})
 
 
+@pytest.mark.parametrize("rtk", [True, False])
+def test_a_run_without_loss_of_rtk_misses_no_sensor(rtk: bool, tmp_path: Path) -> None:
+    """Nor does one without any: 'none of the messages could be used' made a good track one to use with care."""
+    make = Messages(2)
+    items = drive(make, sigma_m=0.01 if rtk else 0.5, status=2)
+    _, config, _ = look(tmp_path, items, make)
+    gnss = config.sensors["gnss"]
+    turns = {name: gnss.model_copy(update={"fixes": name}) for name in ("rtk", "other")}
+    config = config.model_copy(update={"sensors": {"imu": config.sensors["imu"], **turns}})
+    assert not [line for line in read_recording(tmp_path / "run", config).warnings if "could be used" in line]
+    alone = config.with_sensors({"rtk" if rtk else "other": turns["rtk"].model_copy(update={"enabled": False})})
+    assert any("could be used" in line for line in read_recording(tmp_path / "run", alone).warnings)
+
+
 @pytest.mark.parametrize("claims_m", [0.05, 500.0])
 def test_what_a_receiver_claims_without_rtk_is_nothing_to_its_rtk(claims_m: float, tmp_path: Path) -> None:
     """Centimetres without RTK were taken for RTK; a placeholder for the others' sigma scaled that of RTK."""

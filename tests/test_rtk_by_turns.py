@@ -1,22 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """A receiver whose RTK comes and goes: centimetres while it is there, honest bounds while it is not, and nothing missing."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from graphloc import app
+from graphloc.build import shared_constants
 from graphloc.config import GnssConfig, SlowErrorConfig, VesselConfig
+from graphloc.eval.drill import script
+from graphloc.eval.ekf import run_honest
+from graphloc.eval.holdout import HoldOut, telling
+from graphloc.eval.report import Trust, verdict
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, Geodetic
+from graphloc.frozen_receiver import FROZEN
+from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Recording
 from graphloc.solution import Cause, Health, Solution
 from graphloc.trajectory import bounds_95
+from tests.bagfactory import S
+from tests.faults import arrivals_of, feed
 from tests.slowly import with_few_states
+from tests.test_online_faults import smoother
 
 RTK_S, OTHER_S, SIGMA_M = 14.0, 16.0, {True: 0.02, False: 1.0}
 TRACK = Scenario(path="loops", duration_s=105.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, pose_hz=0.0)
@@ -100,3 +113,120 @@ def test_a_wrong_rtk_fix_is_not_followed(solve: Callable[[Recording, VesselConfi
     assert np.sqrt(np.mean(off_m[jumped] ** 2)) < 1.0
     assert np.mean(off_m < bounds_95(np.asarray(solution.trajectory.cov))[:, 0]) > 0.9
     assert any("gnss: position jump" in line for line in (*solution.stats.warnings, *solution.stats.events))
+
+
+def test_held_out_fixes_without_rtk_measure_nothing() -> None:
+    """They are kept out as well, else the track would know what it is to predict; off by metres, they were all of its error."""
+    _, two = receiver(comes_and_goes, lambda t: (0.0, 0.0) if comes_and_goes(t) else (1.5, -1.5))
+    found = app.smooth_recording(replace(two.recording, truth=None), two.config, hold_out=HoldOut(every=5))
+    held = [row.sensor for row in found.recording.rows if row.outcome is Outcome.HELD_OUT]
+    assert set(held) == {"gnss", "gnss_other"}
+    assert {m.sensor for m in found.held} == {"gnss"}
+    assert len(found.held) == held.count("gnss")
+    assert f"Another {held.count('gnss_other')} without RTK were kept out" in app.report_data(found).truth_statement
+    without = two.recording.where(lambda m: m.sensor != "gnss")
+    _, left = HoldOut(every=5).split(without)
+    assert telling(left, two.config) == left  # where there is nothing better
+
+
+def test_a_receiver_that_hangs_repeats_what_it_said_last_with_rtk_or_without() -> None:
+    _, two = receiver(comes_and_goes, lambda _t: (0.0, 0.0))
+    begin_ns = int(two.truth.stamps_ns[0]) + 44 * S  # RTK until then, and none when it speaks again
+    hangs = next(f for f in script(two.recording, two.config)[0] if f.name == "GNSS frozen, 30 s")
+    during = [
+        m
+        for m in hangs.on(two.recording, begin_ns, 0).recording.of(GnssPosition)
+        if 0 <= m.stamp_ns - begin_ns < 30 * S
+    ]
+    assert len(during) > 50
+    assert len({(m.sensor, m.position) for m in during}) == 1
+    assert during[0].sensor == "gnss"
+    solution = app.solve(
+        hangs.on(two.recording, begin_ns, 0).recording, two.config, app.choose_datum(two.recording, two.config)
+    )
+    frozen = [row for row in solution.ledger if row.reason.startswith(FROZEN)]
+    assert len(frozen) == len(during)  # the next fix, which shows it, is without RTK
+    assert any(line.startswith("gnss: for ") and FROZEN in line for line in solution.stats.warnings)
+
+
+def test_it_is_one_receiver_to_a_filter() -> None:
+    """Its slow error is shared by all fixes of a second, and after ten seconds of refusals any is taken."""
+    one, two = receiver(comes_and_goes, lambda t: (0.0, 0.0) if comes_and_goes(t) else (4.0, 0.0))
+    datum = app.choose_datum(one.recording, one.config)
+    tracks = [run_honest(run.recording, run.config, datum).trajectory for run in (one, two)]
+    np.testing.assert_array_equal(tracks[1].p_world_m, tracks[0].p_world_m)
+    np.testing.assert_array_equal(tracks[1].cov, tracks[0].cov)
+
+
+def elsewhere(run: SimulatedRun, **gnss: Any) -> SimulatedRun:
+    """Its antenna is taken to sit 1 m ahead of where it does, which is to be found with the run."""
+    receivers = run.config.of_kind("gnss")
+    mount = receivers["gnss"].mount.model_copy(update={"xyz_m": (1.0, 0.0, 0.0)})
+    unknown = {"mount": mount, "mount_sigma_m": 1.0, "stamp_sigma_s": 0.05, **gnss}
+    changed = {name: block.model_copy(update=unknown) for name, block in receivers.items()}
+    return replace(run, config=run.config.with_sensors(changed))
+
+
+@pytest.mark.parametrize("solve", [app.smooth_recording, app.replay_recording], ids=["offline", "online"])
+def test_it_has_one_antenna_and_one_clock(solve: Callable[[Recording, VesselConfig], app.Run]) -> None:
+    """Found by what tells it, the fixes of RTK, it is known of the others as well; and it is said once."""
+    _, two = receiver(comes_and_goes, lambda t: (0.0, 0.0) if comes_and_goes(t) else (2.0, -1.0))
+    run = solve(two.recording, elsewhere(two, mount_sigma_m=0.25).config)
+    found = run.solution
+    off_m, other_m = (found.antennas_off_m[name] for name in ("gnss", "gnss_other"))
+    assert off_m[0] == pytest.approx(-1.0, abs=0.2)
+    np.testing.assert_array_equal(other_m, off_m)
+    lines = [w for w in (*found.stats.warnings, *found.stats.events) if "mount.xyz_m[0]" in w]
+    assert len({line.partition("gnss")[2] for line in lines}) == 1, lines
+    unmeasured = replace(run, recording=replace(run.recording, truth=None))
+    reasons = verdict(app.report_data(unmeasured)).reasons
+    told = [reason.text for reason in reasons if "Where the antenna of" in reason.text]
+    assert len(told) == (1 if found.stats.online else 0)
+    if run.calibration is not None:
+        keys = [c.key for c in run.calibration.checks] + [s.key for s in run.calibration.suggestions]
+        of = {key.split(".")[1] for key in keys}
+        assert "gnss" in of
+        assert "gnss_other" not in of
+        (said,) = (s for s in run.calibration.suggestions if s.key == "sensors.gnss.mount.xyz_m[0]")
+        assert "also of gnss_other" in said.action
+
+
+def test_parts_that_are_set_otherwise_have_constants_of_their_own() -> None:
+    _, two = receiver(comes_and_goes, lambda _t: (0.0, 0.0))
+    config = elsewhere(two).config
+    assert shared_constants("gnss_other", config) == list(config.sensors).index("gnss")
+    assert shared_constants("gnss", config) is None
+    measured = config.sensors["gnss"].model_copy(update={"mount_sigma_m": 0.0})
+    assert shared_constants("gnss_other", config.with_sensors({"gnss": measured})) is None
+
+
+def test_online_resumes_with_its_one_antenna(tmp_path: Path) -> None:
+    """What is known of it stands once in the snapshot, and holds for both."""
+    _, two = receiver(comes_and_goes, lambda t: (0.0, 0.0) if comes_and_goes(t) else (2.0, -1.0))
+    config = elsewhere(two).config
+    run = replace(two, config=config)
+    came, path = arrivals_of(run), tmp_path / "snapshot.json"
+    known, events = list[Any](), list[str]()
+    for part in np.array_split(np.arange(len(came)), 2):
+        events += feed(smoother(run, snapshot=path), run, came[part[0] : part[-1] + 1]).events
+        known += [(name, number) for name, number, _ in json.loads(path.read_text())["anchor"]["constants"]]
+    assert known == [("gnss", 0)] * 2
+    assert any(event.startswith("resumed from a snapshot") for event in events)
+
+
+def test_one_receiver_is_one_witness_against_another() -> None:
+    """Which of two receivers is wrong is not told by one of them because it has RTK at times."""
+    _, two = receiver(comes_and_goes, lambda _t: (0.0, 0.0))
+    run = app.smooth_recording(two.recording, two.config)
+    far = [
+        replace(
+            m, sensor="stern", seq=90_000 + k, position=m.position._replace(latitude_deg=m.position.latitude_deg + 1e-3)
+        )
+        for k, m in enumerate(two.recording.of(GnssPosition, "gnss"))
+    ]
+    stern = two.config.sensors["gnss"].model_copy(update={"fixes": "any", "topic": "/stern"})
+    recording = replace(two.recording, measurements=(*two.recording.measurements, *far))
+    beside = replace(run, recording=recording, config=two.config.with_sensors({"stern": stern}))
+    (said,) = (reason for reason in verdict(app.report_data(beside)).reasons if "of stern" in reason.text)
+    assert said.trust is Trust.NO
+    assert "this run does not tell which" in said.text

@@ -226,6 +226,23 @@ def test_which_sensor() -> None:
     assert len(said({**FIX, "sensor": "x"}, parse_config({"sensors": many}, KINDS, "test")).row.reason) == 200
 
 
+def test_a_fix_goes_to_the_sensor_that_reads_it() -> None:
+    """Of a receiver whose RTK comes and goes; whoever sent all fixes to one of the two lost those of the other."""
+    turns = {"gnss": {"kind": "gnss", "fixes": "rtk"}, "gnss_other": {"kind": "gnss", "fixes": "other"}}
+    config = parse_config({"sensors": turns}, KINDS, "test")
+    rtk = {**FIX, "status": "gbas", "sigma_m": [0.02, 0.02, 0.04]}
+    others = [FIX, {**rtk, "status": "fix"}, {**rtk, "sigma_m": [0.5, 0.5, 1.0]}]
+    for named in ({}, {"sensor": "gnss"}, {"sensor": "gnss_other"}):
+        assert said({**rtk, **named}, config).sensor == "gnss"
+        assert [said({**other, **named}, config).sensor for other in others] == ["gnss_other"] * 3
+    alone = parse_config({"sensors": {"gnss": turns["gnss"]}}, KINDS, "test")
+    assert said(FIX, alone).row.outcome is Outcome.IGNORED
+    sets = {f"{name}_{side}": block for side in ("bow", "stern") for name, block in turns.items()}
+    unclear = parse_config({"sensors": sets}, KINDS, "test")  # without topics nothing tells whose they are
+    assert said({**FIX, "sensor": "gnss_other_stern"}, unclear).sensor == "gnss_other_stern"
+    assert said({**rtk, "sensor": "gnss_stern"}, unclear).sensor == "gnss_stern"
+
+
 def test_stream_and_bag_give_the_same(tmp_path: Path) -> None:
     """All kinds in one bag and as lines; the IMU's time offset applies to both."""
     make, half = Messages(2), 0.5**0.5

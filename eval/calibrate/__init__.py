@@ -99,11 +99,18 @@ def _configured(name: Name, recording: Recording, config: VesselConfig) -> tuple
 
 
 def _of_one_antenna(sensor: str, recording: Recording, config: VesselConfig) -> list[str]:
-    """Return the sensors of other kinds at the same position: their lever arm is estimated from all of them together."""
+    """Return the sensors of other kinds, and of the same receiver, at the same position: their lever arm is estimated from all of them together."""
     own = config.sensors[sensor]
     place = mount_of(sensor, own, recording.mounts)[0]
     others = [n for kind in PROBE if kind != own.kind and "x" in PROBE[kind] for n in config.of_kind(kind)]
+    others += config.by_turns(sensor)[1:]
     return [n for n in others if np.array_equal(mount_of(n, config.sensors[n], recording.mounts)[0], place)]
+
+
+def _of_one_clock(sensor: str, config: VesselConfig) -> list[str]:
+    """Return the other sensors that read the same receiver by turns, at the same offset: the delay is estimated from all of them together."""
+    block = config.sensors[sensor]
+    return [n for n in config.by_turns(sensor)[1:] if config.sensors[n].time_offset_s == block.time_offset_s]
 
 
 def _imu_at_origin(recording: Recording, config: VesselConfig) -> str:
@@ -138,6 +145,8 @@ def _suggestion(
         action = "the track has it in it already, by mount_sigma_m; measure it, then set it and mount_sigma_m: 0"
     if name[1] in _AXIS and (shares := _of_one_antenna(name[0], recording, config)):
         action += f", also of {', '.join(shares)}, taken for the same antenna"
+    if name[1] == "time" and (same := _of_one_clock(name[0], config)):
+        action += f", also of {', '.join(same)}, of the same receiver"
     if name[1] != "time" and name[0] in recording.mounts:
         action = (
             "measure it; its mount comes from /tf_static: correct it there, or set xyz_m and rpy_deg without tf_frame"

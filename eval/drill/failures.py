@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 
+from graphloc.config import VesselConfig
 from graphloc.eval.simulate.noise import drift_m
 from graphloc.frames import Array, Datum, Geodetic, wrap_angle
 from graphloc.ledger import Outcome
@@ -70,9 +71,16 @@ class Failure:
         return self.strike(recording, begin_ns, begin_ns + round(self.length_s * NS_PER_S), rng)
 
 
-def script(recording: Recording) -> tuple[tuple[Failure, ...], tuple[tuple[str, str], ...]]:
-    """Return the failures that are possible with a recording's sensors; of the others, names and reasons."""
+def script(
+    recording: Recording, config: VesselConfig | None = None
+) -> tuple[tuple[Failure, ...], tuple[tuple[str, str], ...]]:
+    """Return the failures that are possible with a recording's sensors; of the others, names and reasons.
+
+    Args:
+        config: which sensors are of one receiver; None: each is of its own.
+    """
     has = {kind: any(isinstance(m, kind) for m in recording.measurements) for kind in _KINDS}
+    receivers = {} if config is None else {name: config.receiver_of(name) for name in config.sensors}
     found: list[Failure] = []
     left: list[tuple[str, str]] = []
 
@@ -95,7 +103,7 @@ def script(recording: Recording) -> tuple[tuple[Failure, ...], tuple[tuple[str, 
         no_gnss,
         _timed("GNSS drift of 3 m", 60.0, partial(_drift, rmse_m=3.0)),
         _timed("GNSS jump of 10 m", 10.0, partial(_jump, size_m=10.0)),
-        _timed("GNSS frozen", 30.0, _frozen),
+        _timed("GNSS frozen", 30.0, partial(_frozen, receivers=receivers)),
     )
     offer(
         no_compass,
@@ -182,16 +190,17 @@ def _jump(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Gener
     )
 
 
-def _frozen(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator) -> Struck:
-    """Repeat what each receiver said last, under new stamps, as a driver does whose receiver hangs."""
+def _frozen(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator, *, receivers: Mapping[str, str]) -> Struck:  # fmt: skip
+    """Repeat what each receiver said last, under new stamps, as a driver does whose receiver hangs; `receivers`: of sensors."""
     last: dict[tuple[str, type[Measurement]], Measurement] = {}
     held: dict[int, Measurement] = {}
     for m in sorted(recording.measurements, key=lambda m: m.stamp_ns):
         if isinstance(m, _GNSS):
-            if _during(m, begin_ns, end_ns) and (m.sensor, type(m)) in last:
-                held[id(m)] = last[m.sensor, type(m)]
+            said = (receivers.get(m.sensor, m.sensor), type(m))
+            if _during(m, begin_ns, end_ns) and said in last:
+                held[id(m)] = last[said]
             else:
-                last[m.sensor, type(m)] = m
+                last[said] = m
     return _changed(recording, lambda m: replace(held[id(m)], stamp_ns=m.stamp_ns, seq=m.seq) if id(m) in held else m)
 
 

@@ -31,7 +31,8 @@ class _HonestEkf:
         gyro = config.sensors[imu.sensor].gyro_noise_radps if imu is not None else 1e-3
         self._Q = np.diag([0.0, 0.0, _ACCEL**2, _ACCEL**2, gyro**2 + np.radians(0.02) ** 2, 1e-10]) * _DT_S
         self._sensors = config.sensors
-        self._count = Counter(m.sensor for m in recording.measurements)
+        self._receivers = {name: config.receiver_of(name) for name in config.sensors}
+        self._count = Counter(self._receiver_of(m) for m in recording.measurements)
         self._span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S if imu is not None and len(imu) else 1.0
         self._agreed_ns: dict[str, int] = {}
         self._recent: deque[Array] = deque(maxlen=round(_MEAN_S * _RATE_HZ))  # accelerations without those of turning
@@ -57,11 +58,16 @@ class _HonestEkf:
     def gate(self, m: Measurement, r: Array, H: Array, P: Array, R: Array) -> Array | str:
         R = R + self._slow(m, len(R))
         nis = float(r @ np.linalg.solve(H @ P @ H.T + R, r))
-        waited_s = (m.stamp_ns - self._agreed_ns.setdefault(m.sensor, m.stamp_ns)) / NS_PER_S
+        receiver = self._receiver_of(m)
+        waited_s = (m.stamp_ns - self._agreed_ns.setdefault(receiver, m.stamp_ns)) / NS_PER_S
         if nis > chi2_below(_GATE, len(r)) and waited_s < _PATIENCE_S:
             return f"outside the {100 * _GATE:g} % gate"
-        self._agreed_ns[m.sensor] = m.stamp_ns
+        self._agreed_ns[receiver] = m.stamp_ns
         return R
+
+    def _receiver_of(self, m: Measurement) -> str:
+        """Return the sensor that stands for all that read one receiver by turns: it is one to a filter."""
+        return self._receivers.get(m.sensor, m.sensor)
 
     def _mean_with(self, accel: Array) -> Array:
         """Return the mean acceleration (2,) of the last seconds, with this one."""
@@ -73,7 +79,7 @@ class _HonestEkf:
 
     def _slow(self, m: Measurement, size: int) -> Array:
         """Return the covariance (size, size) of a slow error, which all measurements of a second share."""
-        per_s = max(self._count[m.sensor] / self._span_s, 1.0)
+        per_s = max(self._count[self._receiver_of(m)] / self._span_s, 1.0)
         if isinstance(m, GnssPosition):
             return np.eye(2) * per_s  # 1 m
         if not isinstance(m, BodyVelocity):

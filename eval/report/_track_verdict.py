@@ -153,7 +153,8 @@ def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
         if half_m > max(_APART_M, _APART_SIGMAS * sensor.slow_error.horizontal_sigma_m):
             far[name] = half_m
         else:
-            near.append(name)
+            near.append(data.config.receiver_of(name))
+    near = list(dict.fromkeys(near))
     if near:
         others = [name for kind in _BESIDE_GNSS for name in data.config.of_kind(kind)]
         near += [name for name in others if solution.ledger.used(name) >= _FEWEST_USED]
@@ -224,6 +225,9 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
     bound_m = float(np.median(bounds_95(track.cov)[:, 0]))
     suggestions, checks = (data.calibration.suggestions, data.calibration.checks) if data.calibration else ((), ())
     for name, block in data.config.of_kind("gnss").items():
+        first = data.config.receiver_of(name)
+        if name != first and block.mount == data.config.sensors[first].mount:
+            continue  # the same antenna
         if block.mount_sigma_m > 0.0:  # it is estimated, and in the bounds
             if solution.stats.online:
                 yield Reason(

@@ -79,6 +79,7 @@ def smooth_recording(
     held: tuple[GnssPosition, ...] = ()
     if hold_out is not None:
         recording, held = hold_out.split(recording)
+        held = holdout.telling(held, config)
     datum = choose_datum(recording, config)
     recording = with_synthetic(recording, config, datum)
     matched = scans is not None and bool(config.of_kind("aerial"))
@@ -228,7 +229,8 @@ def solve(
         SolveError: it cannot be started or solved.
     """
     config = seen_frames(config, recording)
-    recording, said = without_frozen_fixes(recording, datum)
+    receivers = {name: config.receiver_of(name) for name in config.sensors}
+    recording, said = without_frozen_fixes(recording, datum, receivers)
     solution = smooth(recording, config, datum, rows=SENSORS, inertial=INERTIAL, probe=probe, progress=progress)
     return replace(solution, stats=replace(solution.stats, warnings=(*solution.stats.warnings, *said)))
 

@@ -16,6 +16,7 @@ from graphloc.eval.docking import docking_table
 from graphloc.eval.ekf import named_tracks
 from graphloc.eval.holdout import suggested
 from graphloc.folders import fresh_folder
+from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
@@ -61,9 +62,15 @@ def truth_statement(run: Run) -> str:
         started = " The EKFs are started at it, as BL started theirs; graphloc is not." if begun else ""
         return f"Truth: {named}, {len(truth)} poses over {span_s:.0f} s; it was not fused.{started}"
     if run.held:
+        left = sum(row.outcome is Outcome.HELD_OUT for row in run.recording.rows) - len(run.held)
+        beside = (
+            f" Another {left} without RTK were kept out as well; they tell less, as they are off by more."
+            if left
+            else ""
+        )
         return (
             f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; their own noise is part "
-            "of the error. The track in this folder lacks them: for the best track run again without --hold-out."
+            f"of the error.{beside} The track in this folder lacks them: for the best track run again without --hold-out."
         )
     said = "No truth and no held-out fixes: nothing here measures accuracy"
     by = suggested(run.recording.of(GnssPosition))

@@ -17,6 +17,7 @@ from graphloc.build._attach import (
     asks_for_delay,
     attach,
     constant_keys,
+    every_constant,
     nav_state,
     solved_constants,
     state_of,
@@ -45,7 +46,7 @@ from graphloc.build._graph import (
     cost_of_constants,
     state_keys,
 )
-from graphloc.build._layout import company_of, jumping, make_problem, mount_of, slow_or_left_out
+from graphloc.build._layout import company_of, jumping, make_problem, mount_of, shared_constants, slow_or_left_out
 from graphloc.build._problem import (
     Problem,
     Stream,
@@ -86,11 +87,13 @@ __all__ = [
     "company_of",
     "constant_keys",
     "cost_of_constants",
+    "every_constant",
     "jumping",
     "make_problem",
     "mount_of",
     "nav_state",
     "noisier_imu",
+    "shared_constants",
     "slow_begin",
     "slow_end",
     "slow_or_left_out",

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Protocol
 
 import gtsam
@@ -92,6 +92,11 @@ class Attaching(Protocol):
     @property
     def constants(self) -> tuple[Constant, ...]:
         """What its measurements may share."""
+        ...
+
+    @property
+    def shares(self) -> int | None:
+        """Number of the sensor that has the same constants; None: they are its own."""
         ...
 
     @property
@@ -244,4 +249,10 @@ def solved_constants(stream: Attaching, values: gtsam.Values) -> Iterator[tuple[
 
 def constant_keys(stream: Attaching) -> list[int]:
     """Return the keys of a sensor's constants."""
-    return [keys.constant(stream.number, k) for k in range(len(stream.constants))]
+    number = stream.number if stream.shares is None else stream.shares
+    return [keys.constant(number, k) for k in range(len(stream.constants))]
+
+
+def every_constant(streams: Iterable[Attaching]) -> list[int]:
+    """Return the keys of the constants of some sensors, of shared ones once."""
+    return list(dict.fromkeys(key for stream in streams for key in constant_keys(stream)))

@@ -185,10 +185,11 @@ def state_keys(problem: Problem, first: int, last: int) -> list[int]:
 
 def cost_of_constants(problem: Problem, values: gtsam.Values, known: Collection[int]) -> float:
     """Return -log of how probable the constants in `values` are, but for a constant, without those of the keys `known`."""
-    cost = 0.0
+    cost, seen = 0.0, set(known)
     for stream in problem.streams:
         for (key, value), constant in zip(constants_of(stream, values), stream.constants, strict=True):
-            if key not in known:
+            if key not in seen:
+                seen.add(key)
                 squares = float(((value / constant.sigma) ** 2).sum())
                 cost += 0.5 * CONSTANT_TAILS * float(np.log1p(squares / CONSTANT_TAILS))
     return cost
@@ -208,7 +209,7 @@ def _add_constants(
     """
     used = set(graph.keyVector()) if stream.constants else set()
     for (key, known), constant in zip(constants_of(stream, values), stream.constants, strict=True):
-        if key in used:
+        if key in used and not guess.exists(key):  # two sensors may share it
             guess.insert(key, known)
             if isinstance(prior, Past) and key in prior.known:
                 continue

@@ -32,6 +32,19 @@ def mount_of(name: str, config: SensorConfig, mounts: Mounts) -> tuple[Array, Ar
     return mounts.get(name) or (config.mount.t_body_sensor_m, config.mount.R_body_sensor)
 
 
+def shared_constants(name: str, config: VesselConfig) -> int | None:
+    """Return the number of the sensor that has the same constants as another one: of those that read one receiver by turns the first.
+
+    A receiver has one antenna and one clock. None: they are its own, or it is set otherwise than the first.
+    """
+    first, same = (
+        config.receiver_of(name),
+        {"mount", "stamps", "time_offset_s", "clock_drift_ppm", "stamp_sigma_s", "mount_sigma_m"},
+    )
+    block, other = (config.sensors[of].model_dump(include=same) for of in (name, first))
+    return list(config.sensors).index(first) if name != first and block == other else None
+
+
 def company_of(config: VesselConfig, rows: Sequence[Sensor], seen: Container[str] | None = None) -> int:
     """Return how many sensors (of those in `seen`, if given) can separate each other's slow errors from motion."""
     able = (name for row in rows if row.company for name in config.of_kind(row.kind))
@@ -120,7 +133,7 @@ def _streams(
     """Return the streams of the sensors that have measurements, attached to the states of a problem that has none yet."""
     by_kind = {row.kind: row for row in rows}
     absolute = [name for name in by_sensor if by_kind[problem.config.sensors[name].kind].absolute]
-    alone = len({min(problem.config.by_turns(name)) for name in absolute}) == 1
+    alone = len({problem.config.receiver_of(name) for name in absolute}) == 1
     found = []
     for number, (name, config) in enumerate(problem.config.sensors.items()):
         if name not in by_sensor:
@@ -140,6 +153,7 @@ def _streams(
                 left_out=left_out,
                 position_jumps=jumps,
                 constants=constants,
+                shares=shared_constants(name, problem.config),
                 mount=gtsam.Pose3(gtsam.Rot3(R), t - problem.t_body_imu_m),
                 measurements=tuple(own),
                 state=state,
@@ -159,8 +173,7 @@ def _slow_and_jumps(
     slow, left_out = slow_or_left_out(row, config, company)
     jumps = _NO_JUMPS
     # What a receiver says with and without RTK is told apart by its slow errors, but neither holds the place while the other jumps.
-    by_turns = getattr(config, "fixes", "any") != "any"
-    if alone and (slow is None or by_turns) and row.absolute and row.false is None:
+    if alone and (slow is None or config.takes_turns) and row.absolute and row.false is None:
         jumps = _position_jumps(row, measurements, datum, allowed_jump_m(left_out or slow))
     if left_out is not None and len(jumps[0]):
         slow, left_out = without_drift(left_out), None

@@ -43,6 +43,7 @@ class Stream:
             from the state before it; None where its stamp is that of a state.
         gyro_radps: (M, 3) raw rate at each measurement, body axes. felt: (M, 6) raw specific force and change of the rate about it; 0 where no delay is asked for.
         apart_s: (M,) time since the measurement before; inf for the first.
+        shares: number of the sensor that has the same constants (`shared_constants`); None: they are its own.
         usual: at which slow nodes (N,) its error is at its usual level; None: not known (see `solve/_levels.py`).
     """
 
@@ -62,6 +63,7 @@ class Stream:
     felt: Array
     apart_s: Array
     usual: NDArray[np.bool_] | None = None
+    shares: int | None = None
 
     def between(self, first: int, last: int) -> range:
         """Indices of the measurements that attach to states first..last (inclusive)."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build._attach import constant_keys, nav_state
+from graphloc.build._attach import every_constant, nav_state
 from graphloc.build._layout import apart_s_of
 from graphloc.build._problem import Problem, Stream, with_links
 from graphloc.time import duration_ns
@@ -121,4 +121,4 @@ def _shared_keys(problem: Problem, nodes: range, values: gtsam.Values) -> list[i
     """Return the keys that the whole and the thinned run share: slow nodes and constants."""
     names = [keys.bias(j) for j in nodes]
     names += [keys.slow(s.number, j) for s in problem.streams if s.slow is not None for j in nodes]
-    return names + [key for s in problem.streams for key in constant_keys(s) if values.exists(key)]
+    return names + [key for key in every_constant(problem.streams) if values.exists(key)]

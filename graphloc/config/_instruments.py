@@ -125,7 +125,8 @@ class GnssConfig(SensorConfig):
     """Fixes below this `NavSatStatus` are rejected. `STATUS_NO_FIX` never counts as a fix."""
     fixes: Literal["any", "rtk", "other"] = "any"
     """Which it reads: `rtk` those of status gbas, where there is one, that state less than 0.1 m (1 sigma, horizontal); `other` the rest. A
-    receiver whose RTK comes and goes is two sensors of one topic, each with a slow error of its own: centimetres, and metres."""
+    receiver whose RTK comes and goes is two sensors of one topic, each with a slow error of its own: centimetres, and metres. Where both have the
+    same mount, stamps and unknowns (`stamp_sigma_s`, `mount_sigma_m`), these are estimated as of one antenna and one clock."""
     sigma_scale: Positive = 1.0
     """Factor on the reported standard deviations, for the white part of the error."""
     min_horizontal_sigma_m: Positive = 0.02
@@ -154,6 +155,11 @@ class GnssConfig(SensorConfig):
     def tells_height(self) -> bool:
         """Its fixes do."""
         return True
+
+    @property
+    def takes_turns(self) -> bool:
+        """It does where the other fixes are another sensor's."""
+        return self.fixes != "any"
 
 
 class CompassConfig(SensorConfig):

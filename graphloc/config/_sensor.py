@@ -85,6 +85,11 @@ class SensorConfig(Block):
         return False
 
     @property
+    def takes_turns(self) -> bool:
+        """Whether it is one of those that read a receiver's fixes by turns (`VesselConfig.by_turns`)."""
+        return False
+
+    @property
     def synthetic_every_s(self) -> float:
         """Time between two of the measurements that the configuration makes itself (`Sensor.synthetic`), s."""
         return 1.0

@@ -161,10 +161,14 @@ class VesselConfig(Block):
     def by_turns(self, name: str) -> list[str]:
         """Return the names of the enabled sensors that read one receiver's fixes by turns (`fixes`), this one among them."""
         own = self.sensors[name]
-        if getattr(own, "fixes", "any") == "any":
+        if not own.takes_turns:
             return [name]
-        others = {n: s for n, s in self.of_kind(own.kind).items() if n != name and s.fixes != "any"}
+        others = {n: s for n, s in self.of_kind(own.kind).items() if n != name and s.takes_turns}
         return [name, *(n for n, s in others.items() if (s.topic, s.nmea) == (own.topic, own.nmea))]
+
+    def receiver_of(self, name: str) -> str:
+        """Return the name that stands for all sensors that read one receiver's fixes by turns: that of the first."""
+        return min(self.by_turns(name), key=list(self.sensors).index)
 
     def of_kind(self, kind: str) -> dict[str, Any]:
         """Return the enabled sensors of a kind, by name."""

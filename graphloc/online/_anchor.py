@@ -127,9 +127,8 @@ class Anchor:
         """
         j = int(problem.timeline.slow_of[k])
         slow = {s.name: keys.slow(s.number, j) for s in problem.streams if s.slow is not None}
-        constants = {
-            (s.name, n): key for s in problem.streams for n, key in enumerate(constant_keys(s)) if key in past.known
-        }
+        named = {key: (s.name, n) for s in reversed(problem.streams) for n, key in enumerate(constant_keys(s))}
+        constants = {of: key for key, of in named.items() if key in past.known}  # shared ones once
         order = gtsam.Ordering()
         for key in (keys.pose(k), keys.velocity(k), keys.bias(j), *slow.values(), *constants.values()):
             order.push_back(key)

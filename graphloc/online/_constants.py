@@ -53,8 +53,9 @@ class Constants:
 
     def _keys(self) -> Iterator[tuple[Number, int]]:
         for stream in self._problem.streams.values():
-            for n, key in enumerate(constant_keys(stream)):
-                yield (stream.name, n), key
+            if stream.shares is None:
+                for n, key in enumerate(constant_keys(stream)):
+                    yield (stream.name, n), key
 
     def use(self, stream: LiveStream, used: set[int]) -> None:
         """Stage those constants of a stream that are among the `used` keys of new factors, and keep them in the window."""
@@ -108,7 +109,9 @@ class Constants:
                 yield constant, self._known[key].value
 
     def far_off(self, stream: LiveStream) -> Iterator[tuple[str, str]]:
-        """Yield each setting of a stream that is clearly far from where the window has it, and a line on that."""
+        """Yield each setting of a stream that is clearly far from where the window has it, and a line on that; of what it shares another says it."""
+        if stream.shares is not None:
+            return
         for constant, key in zip(stream.constants, constant_keys(stream), strict=True):
             if constant.corrects and self._window.is_committed(key):
                 value = self._window.values.atVector(key)

@@ -14,7 +14,16 @@ from typing import Any, Generic, TypeVar
 import gtsam
 import numpy as np
 
-from graphloc.build import Carry, asks_for_delay, company_of, mount_of, slow_or_left_out, state_of, without_drift
+from graphloc.build import (
+    Carry,
+    asks_for_delay,
+    company_of,
+    mount_of,
+    shared_constants,
+    slow_or_left_out,
+    state_of,
+    without_drift,
+)
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, InertialLink, Sensor, SlowProcess
@@ -165,6 +174,7 @@ class LiveStream:
             separates it from motion; both, once the receiver has jumped: then the window estimates its jumps.
         by_stamp: stamps (ns) and indices of the measurements that are kept, in order.
         jumps: those that the window estimates.
+        shares: as of a `build.Stream`.
     """
 
     number: int
@@ -186,6 +196,7 @@ class LiveStream:
     frozen_detector: FrozenReceiverDetector = field(default_factory=FrozenReceiverDetector)
     receiver: ReceiverDetectors = field(default_factory=ReceiverDetectors)
     jumps: tuple[PositionJump, ...] = ()
+    shares: int | None = None
 
     @property
     def frozen(self) -> bool:
@@ -319,6 +330,7 @@ def live_problem(
             slow=slow,
             left_out=left_out,
             constants=row.constants(block),
+            shares=shared_constants(name, config),
             mount=gtsam.Pose3(gtsam.Rot3(R_sensor), t_sensor - t),
             scatter=Scatter(jumps=slow is not None and slow.jumps),
             receiver=receiver,

@@ -50,11 +50,13 @@ def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
     problem, values, prior = _with_offsets_free(result)
     rows = linearised(problem, values, result.verdicts, prior)
     columns: dict[tuple[str, Offset], Array] = {}
+    numbered = {stream.number: stream for stream in problem.streams}
     for stream in problem.streams:
+        first = stream if stream.shares is None else numbered.get(stream.shares, stream)  # of one antenna and one clock
         wanted = tuple(probe.get(stream.config.kind, ()))
         own = _columns(problem, stream, rows, values, result, wanted) if wanted else np.zeros((0, 0))
         for c, what in enumerate(wanted):
-            name = _antenna_of(problem, stream, probe) if what in ("x", "y") else stream.name
+            name = _antenna_of(problem, first, probe) if what in ("x", "y") else first.name
             columns[name, what] = own[:, c] + columns.get((name, what), 0.0)
     if not columns:
         return None

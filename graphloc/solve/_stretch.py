@@ -18,7 +18,7 @@ from graphloc.build import (
     StartPrior,
     attach,
     build_graph,
-    constant_keys,
+    every_constant,
     nav_state,
     state_keys,
 )
@@ -117,19 +117,15 @@ def moved(old: gtsam.Values, new: gtsam.Values) -> float:
 def update_states(problem: Problem, values: gtsam.Values, new: gtsam.Values, first: int, last: int) -> None:
     """Write the states first..last of `new` into `values` (in place: a copy each would be quadratic)."""
     values.update(new.extract(state_keys(problem, first, last)))
-    for key in _constants(problem):
+    for key in every_constant(problem.streams):
         if new.exists(key):
             values.insert_or_assign(key, new.atVector(key))
 
 
 def copy_states(problem: Problem, values: gtsam.Values, first: int, last: int) -> gtsam.Values:
     """Return the values of states first..last and of their slow states."""
-    constants = [key for key in _constants(problem) if values.exists(key)]
+    constants = [key for key in every_constant(problem.streams) if values.exists(key)]
     return values.extract(state_keys(problem, first, last) + constants)
-
-
-def _constants(problem: Problem) -> list[int]:
-    return [key for stream in problem.streams for key in constant_keys(stream)]
 
 
 def unwound(problem: Problem, values: gtsam.Values) -> gtsam.Values:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build import CONSTANT_TAILS, Problem, Stream, solved_constants
+from graphloc.build import CONSTANT_TAILS, Problem, Stream, constant_keys, every_constant, solved_constants
 from graphloc.config import SIGMA_SCALES, PoseConfig, SensorConfig
 from graphloc.frames import Array
 from graphloc.graph import TIME_OFFSET, Constant, SlowProcess, corrections
@@ -174,8 +174,10 @@ def mount_event(problem: Problem) -> tuple[str, ...]:
 def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
     expected = expected_cost(problem, result.verdicts)
     warnings = [*problem.warnings, *_of_the_run(problem, result, expected)]
-    for stream in problem.streams:
+    for n, stream in enumerate(problem.streams):
         warnings += _of_a_sensor(stream, result)
+        said = set(every_constant(problem.streams[:n]))
+        warnings += _of_constants(stream, result) if said.isdisjoint(constant_keys(stream)) else []
     return SolveStats(
         passes=result.passes,
         iterations=result.iterations,
@@ -269,6 +271,18 @@ def _lasting_error(stream: Stream, verdicts: Sequence[Verdict]) -> list[str]:
     return [f"{said}: set slow_error: {{sigma_m: {found.sigma_m:.2g}, time_constant_s: {found.time_s:.0f}}}, or more"]
 
 
+def _of_constants(stream: Stream, result: BatchResult) -> list[str]:
+    warnings = list[str]()
+    for constant, value in solved_constants(stream, result.values):
+        warnings += [said for *_, said in far_off(stream.name, constant, value, stream.mount)]
+        if not constant.corrects and (off := np.abs(value / constant.sigma).max()) > FAR_OFF:
+            warnings.append(
+                f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
+                "its sigmas"
+            )
+    return warnings
+
+
 def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     warnings = list[str]()
     far, said = _far_from_prior(stream, result)
@@ -279,13 +293,6 @@ def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     else:
         warnings += _turned_mount(stream, result)
     warnings += late_far_off(stream.name, stream.slow, late_of(stream, result.values) or 0.0)
-    for constant, value in solved_constants(stream, result.values):
-        warnings += [said for *_, said in far_off(stream.name, constant, value, stream.mount)]
-        if not constant.corrects and (off := np.abs(value / constant.sigma).max()) > FAR_OFF:
-            warnings.append(
-                f"{stream.name}: {constant.name} is {off:.1f} sigmas from the survey: survey it again, or raise "
-                "its sigmas"
-            )
     warnings += slow_error_warning(stream.name, stream.left_out)
     allowed = stream.left_out is not None
     warnings += jump_warnings(stream.name, *stream.position_jumps, allowed=allowed, followed=stream.slow is None)
