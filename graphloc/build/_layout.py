@@ -32,16 +32,16 @@ def mount_of(name: str, config: SensorConfig, mounts: Mounts) -> tuple[Array, Ar
     return mounts.get(name) or (config.mount.t_body_sensor_m, config.mount.R_body_sensor)
 
 
+_OF_THE_RECEIVER = {"mount", "stamps", "time_offset_s", "clock_drift_ppm", "stamp_sigma_s", "mount_sigma_m"}
+
+
 def shared_constants(name: str, config: VesselConfig) -> int | None:
     """Return the number of the sensor that has the same constants as another one: of those that read one receiver by turns the first.
 
     A receiver has one antenna and one clock. None: they are its own, or it is set otherwise than the first.
     """
-    first, same = (
-        config.receiver_of(name),
-        {"mount", "stamps", "time_offset_s", "clock_drift_ppm", "stamp_sigma_s", "mount_sigma_m"},
-    )
-    block, other = (config.sensors[of].model_dump(include=same) for of in (name, first))
+    first = config.receiver_of(name)
+    block, other = (config.sensors[of].model_dump(include=_OF_THE_RECEIVER) for of in (name, first))
     return list(config.sensors).index(first) if name != first and block == other else None
 
 
