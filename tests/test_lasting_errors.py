@@ -3,6 +3,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -19,13 +20,16 @@ from graphloc.factors import pose
 from graphloc.frames import Array, Datum
 from graphloc.graph import Decision
 from graphloc.measurements import Measurement, PoseFix
+from graphloc.online._snapshot import Snapshot
 from graphloc.replay import replay
 from graphloc.solution import Graded
 from graphloc.solve._decide import Verdict
 from graphloc.solve._lasting import lasting_error
 from graphloc.solve._warnings import _lasting_error
+from tests.faults import arrivals_of, feed
 from tests.slowly import simulate_slowly
 from tests.test_factors import attachment
+from tests.test_online_faults import smoother
 
 SIGMA_M, TIME_S = 1.5, 40.0
 
@@ -77,6 +81,21 @@ def test_bounds_include_an_error_that_lasts() -> None:
 def test_bounds_include_an_error_that_lasts_online() -> None:
     run = with_usbl(1, sigma_m=SIGMA_M, time_constant_s=TIME_S)
     assert covered(run, replay(run.recording, run.config).solution) > 0.85
+
+
+def test_it_goes_on_after_a_restart_but_not_on_other_axes(tmp_path: Path) -> None:
+    """Of as many axes, what was the error to the north would be taken for that of the height."""
+    run, path = with_usbl(2, sigma_m=SIGMA_M, time_constant_s=TIME_S), tmp_path / "snapshot.json"
+    came = arrivals_of(run)
+    came, rest = came[: len(came) // 4], came[len(came) // 4 :][:100]
+    feed(smoother(run, snapshot=path), run, came)
+    (name,) = run.config.of_kind("pose")
+    snapshot = Snapshot.read(path, "imu")
+    assert np.abs(snapshot.anchor_for(run.config).slow[name].value).max() > 0.1
+    resumed = feed(smoother(run, snapshot=path), run, rest)
+    assert any(e.startswith("resumed from a snapshot") for e in resumed.events)
+    other = run.config.sensors[name].model_copy(update={"axes": ("x", "z")})
+    assert name not in snapshot.anchor_for(run.config.with_sensors({name: other})).slow
 
 
 def test_the_honest_filter_is_told_of_it() -> None:
