@@ -194,7 +194,8 @@ class FixErrors(PositionErrors):
         """Return the errors of the fixes as they are predicted, with the slow error of their receiver, where the estimate has found it."""
         off_m, sensor = self.position_m.copy(), np.array([m.sensor for m in self.fixes])
         for name, error in slow.items():
-            own = sensor == name
+            if not (own := sensor == name).any():  # another kind of sensor, whose slow state has other axes
+                continue
             off_m[own] += interpolated(self.stamps_ns[own], error.stamps_ns, error.value[:, :3])
         return PositionErrors(stamps_ns=self.stamps_ns, position_m=off_m, covered=self.covered)
 

@@ -82,7 +82,7 @@ def _by_mode(m: TagSighting, config: AprilTagConfig, seen: TagsSeen, mode: TagMo
         cov=_turned(seen.R) @ mode.cov @ _turned(seen.R).T + np.diag(_TO_DECIDE**2),
         jacobian=jacobian,
         # Edges are no matter where modes are chosen.
-        slow_jacobian=slow_jacobian if seen.rides or seen.mounted else None,
+        slow_jacobian=slow_jacobian if seen.rides or seen.mounted or seen.timed else None,
         prior=mode.probability * (1.0 - config.false_fraction),
         size_m=float(np.hypot(raw[0], raw[1])),
         size_deg=float(np.degrees(np.linalg.norm(raw[3:]))),

@@ -146,7 +146,10 @@ class Links:
         if right == len(self._stamps):
             stamps = np.append(stamps, stop_ns)
         steps = np.diff(stamps)
-        if not len(steps) or (n := int(np.argmax(steps)), steps[n])[1] <= self._max_gap_ns:
+        if not len(steps):
+            return None
+        n = int(np.argmax(steps))
+        if steps[n] <= self._max_gap_ns:
             return None
         return int(stamps[n]), int(stamps[n + 1])
 

@@ -56,7 +56,7 @@ class HealthReason:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SlowEstimate:
-    """A slow state of one sensor over time, e.g. the GNSS error: what must be subtracted from its fixes.
+    """A slow state of one sensor over time, e.g. the error of its fixes or poses: what must be subtracted from them.
 
     Attributes:
         name: what it is, for axis labels, e.g. 'GNSS error'.

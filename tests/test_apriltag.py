@@ -409,12 +409,15 @@ def test_by_how_much_stamps_are_late_is_found_where_the_vessel_is_known(on_a_doc
     assert slow[-2] == pytest.approx(0.2, abs=0.01)  # to first order
 
 
+@pytest.mark.parametrize("mount_sigma_deg", [0.0, 1.0])
 @pytest.mark.parametrize("on_a_dock", [False, True])
-def test_how_a_modes_residual_changes_with_the_slow_state(on_a_dock: bool) -> None:
+def test_how_a_modes_residual_changes_with_the_slow_state(on_a_dock: bool, mount_sigma_deg: float) -> None:
     true = vessel(9.0, 40.0, roll_pitch_deg=(3.0, -2.0))
-    config = (DOCKED if on_a_dock else FIXED).model_copy(update={"cameras": {"bow": CameraConfig(topic="/images")}})
+    bow = CameraConfig(topic="/images", mount_sigma_deg=mount_sigma_deg)
+    config = (DOCKED if on_a_dock else FIXED).model_copy(update={"cameras": {"bow": bow}})
     m = moved_sighting(MOTION, true) if on_a_dock else sighting(true)
-    slow = np.concatenate([MOTION * on_a_dock, [0.004, -0.002, 0.003, 0.01, 0.0]])[0 if on_a_dock else 6 :]
+    turned = [0.004, -0.002, 0.003] if mount_sigma_deg else []
+    slow = np.concatenate([MOTION if on_a_dock else [], turned, [0.01, 0.0]])
     (found, *_) = ROW.residuals(m, config, under_way(true, slow))
     assert found.slow_jacobian is not None
     slopes = found.slow_jacobian()

@@ -193,8 +193,11 @@ def test_a_track_apart_from_a_drifting_receiver_predicts_its_fixes() -> None:
     )  # fmt: skip
     levers = {"gnss": np.zeros(3)}
     off = np.sqrt((2.0**2 + 3.0**2 + 4.0**2) / 3.0)
-    both = {"gnss": drift, "log": drift}  # each is that of its own sensor
-    for slow, predicted in (({"gnss": drift}, 1.0), (both, 1.0), ({"log": drift}, None), ({}, None), (None, None)):
+    flat = replace(
+        drift, axes=drift.axes[:2], units=drift.units[:2], value=drift.value[:, :2], sigma=drift.sigma[:, :2]
+    )
+    both = {"gnss": drift, "usbl": flat}  # each is that of its own sensor
+    for slow, predicted in (({"gnss": drift}, 1.0), (both, 1.0), ({"usbl": flat}, None), ({}, None), (None, None)):
         numbers = metrics.compare_to_held_out(track, held, datum, levers, slow)
         assert numbers.horizontal_rmse_m == pytest.approx(off, abs=1e-6)
         assert numbers.fix_rmse_m == (None if predicted is None else pytest.approx(predicted, abs=1e-6))

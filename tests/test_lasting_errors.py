@@ -3,6 +3,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -12,18 +13,23 @@ import pytest
 from graphloc import app
 from graphloc.build import Stream
 from graphloc.config import PoseConfig
+from graphloc.eval.ekf import run_honest
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.factors import pose
-from graphloc.frames import Array
+from graphloc.frames import Array, Datum
 from graphloc.graph import Decision
 from graphloc.measurements import Measurement, PoseFix
+from graphloc.online._snapshot import Snapshot
 from graphloc.replay import replay
+from graphloc.solution import Graded
 from graphloc.solve._decide import Verdict
 from graphloc.solve._lasting import lasting_error
 from graphloc.solve._warnings import _lasting_error
+from tests.faults import arrivals_of, feed
 from tests.slowly import simulate_slowly
 from tests.test_factors import attachment
+from tests.test_online_faults import smoother
 
 SIGMA_M, TIME_S = 1.5, 40.0
 
@@ -77,6 +83,29 @@ def test_bounds_include_an_error_that_lasts_online() -> None:
     assert covered(run, replay(run.recording, run.config).solution) > 0.85
 
 
+def test_it_goes_on_after_a_restart_but_not_on_other_axes(tmp_path: Path) -> None:
+    """Of as many axes, what was the error to the north would be taken for that of the height."""
+    run, path = with_usbl(2, sigma_m=SIGMA_M, time_constant_s=TIME_S), tmp_path / "snapshot.json"
+    came = arrivals_of(run)
+    came, rest = came[: len(came) // 4], came[len(came) // 4 :][:100]
+    feed(smoother(run, snapshot=path), run, came)
+    (name,) = run.config.of_kind("pose")
+    snapshot = Snapshot.read(path, "imu")
+    assert np.abs(snapshot.anchor_for(run.config).slow[name].value).max() > 0.1
+    resumed = feed(smoother(run, snapshot=path), run, rest)
+    assert any(e.startswith("resumed from a snapshot") for e in resumed.events)
+    other = run.config.sensors[name].model_copy(update={"axes": ("x", "z")})
+    assert name not in snapshot.anchor_for(run.config.with_sensors({name: other})).slow
+
+
+def test_the_honest_filter_is_told_of_it() -> None:
+    """What the graph knows of an error it must know, too, or the comparison flatters the graph: untold, 35 % of the truth lie inside."""
+    run = with_usbl(31, sigma_m=SIGMA_M, time_constant_s=TIME_S)
+    assert run.config.datum is not None
+    track = run_honest(run.recording, run.config, Datum(run.config.datum.geodetic)).trajectory
+    assert float(compare_to_truth(track, run.truth).coverage_95 or 0.0) > 0.6
+
+
 @pytest.mark.parametrize(("axes", "slow"), [("x y", "m m"), ("z", "m"), ("x y z roll pitch yaw", "m m m deg")])
 def test_only_axes_that_are_measured_have_one(axes: str, slow: str) -> None:
     config = PoseConfig.model_validate({"axes": axes.split(), "slow_error": {"sigma_m": 2.0, "sigma_deg": 3.0}})
@@ -126,6 +155,7 @@ def test_errors_that_last_are_said_with_their_size_and_time() -> None:
     (line,) = judged(residuals, every_s, config, share_false=0.05)
     found = re.fullmatch(r"usbl: its errors last for some (\d+) s .*\{sigma_m: ([\d.]+), time_constant_s: (\d+)\}, or more", line)  # fmt: skip
     assert found
+    assert isinstance(line, Graded)  # each leg of a long run has its own figures
     assert float(found[1]) == pytest.approx(TIME_S, rel=0.3)
     assert float(found[2]) == pytest.approx(SIGMA_M, rel=0.2)
     modelled = PoseConfig.model_validate({"axes": ["x", "y"], "slow_error": {"sigma_m": 1.5}})

@@ -88,7 +88,7 @@ def residuals_over_time(solution: Solution) -> Figure | None:
 
 
 def slow_over_time(solution: Solution) -> Figure:
-    """Return the slow states (GNSS error, compass offset, map offset) with 95 % bands, and IMU biases."""
+    """Return the slow states (of fixes and poses, compass offset, image offset, ...) with 95 % bands, and IMU biases."""
     start = int(solution.trajectory.stamps_ns[0])
     panels = [panel for sensor, estimate in solution.slow.items() for panel in _slow_panels(start, sensor, estimate)]
     stamps, axes = solution.trajectory.stamps_ns, ("x", "y", "z")

@@ -51,7 +51,7 @@ _RESIDUALS = (
     "Residual of each measurement in its own standard deviations, before the loss, coloured by its final weight."
 )
 _SLOW = (
-    "Estimated slow errors (GNSS error, compass offset, image offset, docks) with 95 % bands, and IMU biases. "
+    "Estimated slow errors (GNSS error, pose error, compass offset, image offset, docks) with 95 % bands, and IMU biases. "
     "Compass: yaw is the offset of its mount, B to E the magnetic deviation, wander what lasts about a minute."
 )
 

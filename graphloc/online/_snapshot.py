@@ -144,8 +144,8 @@ class Snapshot:
 
 
 def settings_of(config: VesselConfig) -> dict[str, Any]:
-    """Return by sensor, as plain data, what its slow state and constants are added to: mounts, time offset, survey, height."""
-    said = {"mount", "cameras", "lidars", "time_offset_s", "survey", "height_m"}
+    """Return by sensor, as plain data, what its slow state and constants are added to: axes, mounts, time offset, survey, height."""
+    said = {"axes", "mount", "cameras", "lidars", "time_offset_s", "survey", "height_m"}
     return {name: sensor.model_dump(mode="json", include=said) for name, sensor in config.sensors.items()}
 
 

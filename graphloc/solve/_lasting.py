@@ -38,9 +38,9 @@ def lasting(stream: Stream, verdicts: Sequence[Verdict]) -> Lasting | None:
     used = [(m, v.residual) for m, v in zip(stream.measurements, verdicts, strict=True) if v.weight > AGREES]
     if stream.slow is not None or stream.left_out is not None or len(used) < _FEWEST:
         return None
-    long = [stream.row.scaled(m).get("sigma_scale", []) for m, _ in used]
-    axes = max(long, key=len)
-    kept = [k for k, own in enumerate(long) if axes and own == axes]
+    in_m = [stream.row.scaled(m).get("sigma_scale", []) for m, _ in used]  # of each, its axes of position
+    axes = max(in_m, key=len)
+    kept = [k for k, own in enumerate(in_m) if axes and own == axes]
     if len(kept) < _FEWEST:
         return None
     return lasting_error(

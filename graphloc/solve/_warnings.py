@@ -268,7 +268,8 @@ def _lasting_error(stream: Stream, verdicts: Sequence[Verdict]) -> list[str]:
     if not isinstance(stream.config, PoseConfig) or (found := lasting(stream, verdicts)) is None:
         return []
     said = f"{stream.name}: its errors last for some {found.time_s:.0f} s and count as independent, so the bounds are too small"
-    return [f"{said}: set slow_error: {{sigma_m: {found.sigma_m:.2g}, time_constant_s: {found.time_s:.0f}}}, or more"]
+    said += f": set slow_error: {{sigma_m: {found.sigma_m:.2g}, time_constant_s: {found.time_s:.0f}}}, or more"
+    return [Graded(said, f"errors of {stream.name} that last", found.sigma_m)]
 
 
 def _of_constants(stream: Stream, result: BatchResult) -> list[str]:
