@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -366,6 +366,10 @@ class Sensor:
     in_world: bool = False
     along_body: bool = False
     apart_ns: int = 0
+
+    def of(self, config: SensorConfig) -> Sensor:
+        """Return the row of a sensor that is configured so: poses of height or heading alone are no positions, and no company."""
+        return self if config.tells_place else replace(self, absolute=False, company=False)
 
 
 class InertialRow(Protocol):

@@ -19,8 +19,9 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Datum, Geodetic, wrap_angle
 from graphloc.ledger import LedgerRow, Outcome
-from graphloc.measurements import CompassHeading, GnssPosition, HeightPrior, Measurement, PoseFix
+from graphloc.measurements import CompassHeading, GnssPosition, HeightPrior, Measurement, PoseFix, PoseMode
 from graphloc.recording import Recording
+from graphloc.replay import replay
 from graphloc.solution import Solution
 from graphloc.solve._align import _level, _turns, align
 from graphloc.solve._parts import _join_stats
@@ -267,6 +268,33 @@ def test_health_follows_what_agrees() -> None:
     since = solved.since_agreed_s["gnss"]
     k = int(np.searchsorted(t, 28.0))
     assert since[k] == pytest.approx(t[k] - 15.0, abs=0.2)
+
+
+@pytest.mark.parametrize("axes", [("z",), ("yaw",)])
+def test_a_depth_or_a_heading_is_no_position(axes: tuple[str, ...]) -> None:
+    """Poses of z or yaw alone throughout, and no fix from 15 to 30 s: that is dead reckoning, offline and online."""
+    run = simulate_slowly(replace(BASE, duration_s=45.0, pose_hz=1.0, false_fraction=0.0), 3)
+    (name,) = run.config.of_kind("pose")
+
+    def alone(m: Measurement) -> Measurement:
+        if not isinstance(m, PoseFix):
+            return m
+        k = int(np.searchsorted(run.truth.stamps_ns, m.stamp_ns))
+        value = run.truth.p_world_m[k, 2:] if axes == ("z",) else m.modes[0].value[2:]
+        return replace(m, axes=axes, modes=(PoseMode(value=value, cov=np.diag([0.01])),))
+
+    def heard(m: Measurement) -> bool:
+        away_s = (m.stamp_ns - run.truth.stamps_ns[0]) * 1e-9
+        return not (isinstance(m, GnssPosition) and 15.0 < away_s < 30.0)
+
+    config = with_sensors(run, **{name: PoseConfig.model_validate({"topic": "/pose", "axes": axes})})
+    recording = run.recording.where(heard).changed(alone)
+    offline = app.simulated(replace(run, recording=recording, config=config), compare=False).solution
+    for solved in (offline, replay(recording, config).solution):
+        t = (solved.trajectory.stamps_ns - run.truth.stamps_ns[0]) * 1e-9
+        health = np.array([h.value for h in solved.health])
+        assert (health[(t > 21.0) & (t < 29.5)] == "dead_reckoning").all()
+        assert name not in solved.since_agreed_s
 
 
 def test_antenna_height_is_taken_off_the_waterline() -> None:

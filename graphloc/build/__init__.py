@@ -46,7 +46,15 @@ from graphloc.build._graph import (
     cost_of_constants,
     state_keys,
 )
-from graphloc.build._layout import company_of, jumping, make_problem, mount_of, shared_constants, slow_or_left_out
+from graphloc.build._layout import (
+    company_of,
+    jumping,
+    make_problem,
+    mount_of,
+    rows_of,
+    shared_constants,
+    slow_or_left_out,
+)
 from graphloc.build._problem import (
     Problem,
     Stream,
@@ -93,6 +101,7 @@ __all__ = [
     "mount_of",
     "nav_state",
     "noisier_imu",
+    "rows_of",
     "shared_constants",
     "slow_begin",
     "slow_end",

@@ -45,10 +45,14 @@ def shared_constants(name: str, config: VesselConfig) -> int | None:
     return list(config.sensors).index(first) if name != first and block == other else None
 
 
+def rows_of(config: VesselConfig, rows: Sequence[Sensor]) -> dict[str, Sensor]:
+    """Return the row of each enabled sensor, as it is configured."""
+    return {name: row.of(block) for row in rows for name, block in config.of_kind(row.kind).items()}
+
+
 def company_of(config: VesselConfig, rows: Sequence[Sensor], seen: Container[str] | None = None) -> int:
     """Return how many sensors (of those in `seen`, if given) can separate each other's slow errors from motion."""
-    able = (name for row in rows if row.company for name in config.of_kind(row.kind))
-    return sum(seen is None or name in seen for name in able)
+    return sum(row.company and (seen is None or name in seen) for name, row in rows_of(config, rows).items())
 
 
 def slow_or_left_out(row: Sensor, config: SensorConfig, company: int) -> tuple[SlowProcess | None, SlowProcess | None]:
@@ -131,14 +135,14 @@ def _streams(
     company: int,
 ) -> tuple[Stream, ...]:
     """Return the streams of the sensors that have measurements, attached to the states of a problem that has none yet."""
-    by_kind = {row.kind: row for row in rows}
-    absolute = [name for name in by_sensor if by_kind[problem.config.sensors[name].kind].absolute]
+    by_name = rows_of(problem.config, rows)
+    absolute = [name for name in by_sensor if by_name[name].absolute]
     alone = len({problem.config.receiver_of(name) for name in absolute}) == 1
     found = []
     for number, (name, config) in enumerate(problem.config.sensors.items()):
         if name not in by_sensor:
             continue
-        row, own = by_kind[config.kind], by_sensor[name]
+        row, own = by_name[name], by_sensor[name]
         t, R = mount_of(name, config, mounts)
         slow, left_out, jumps = _slow_and_jumps(row, config, own, problem.datum, company, alone=alone)
         state, carry = _states_and_carries(own, problem.timeline, problem.links)

@@ -48,6 +48,11 @@ class AnyPoseConfig(SensorConfig):
         return tuple(a for a in AXES if a in axes)
 
     @property
+    def tells_place(self) -> bool:
+        """Where x or y is used: no depth, and no heading alone."""
+        return "x" in self.axes or "y" in self.axes
+
+    @property
     def tells_height(self) -> bool:
         """Where z is used."""
         return "z" in self.axes

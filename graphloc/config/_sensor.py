@@ -85,6 +85,11 @@ class SensorConfig(Block):
         return False
 
     @property
+    def tells_place(self) -> bool:
+        """Whether its measurements tell where the vessel is in the plane, or how it moves there; as far as their kind does."""
+        return True
+
+    @property
     def takes_turns(self) -> bool:
         """Whether it is one of those that read a receiver's fixes by turns (`VesselConfig.by_turns`)."""
         return False

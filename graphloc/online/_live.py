@@ -19,6 +19,7 @@ from graphloc.build import (
     asks_for_delay,
     company_of,
     mount_of,
+    rows_of,
     shared_constants,
     slow_or_left_out,
     state_of,
@@ -310,13 +311,13 @@ def live_problem(
     """
     config, rows, mounts = setup.config, setup.rows, setup.mounts
     t, R = mount_of(imu.sensor, imu_config, mounts)
-    by_kind = {row.kind: row for row in rows}
+    by_name = rows_of(config, rows)
     company = company_of(config, rows)
     streams = {}
     for number, (name, block) in enumerate(config.sensors.items()):
-        if not block.enabled or block.kind not in by_kind:
+        if name not in by_name:
             continue
-        row = by_kind[block.kind]
+        row = by_name[name]
         slow, left_out = slow_or_left_out(row, block, company)
         t_sensor, R_sensor = mount_of(name, block, mounts)
         receiver = receivers.setdefault(name, ReceiverDetectors())

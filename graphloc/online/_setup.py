@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from graphloc.build import mount_of
+from graphloc.build import mount_of, rows_of
 from graphloc.config import ImuConfig, VesselConfig
 from graphloc.frames import Datum, yaw_from_rotation
 from graphloc.graph import Hint, InertialRow, Sensor
@@ -67,7 +67,7 @@ class Setup:
     @cached_property
     def absolute(self) -> tuple[str, ...]:
         """Names of the enabled sensors that measure position in world."""
-        return tuple(n for row in self.rows if row.absolute for n in self.config.of_kind(row.kind))
+        return tuple(name for name, row in rows_of(self.config, self.rows).items() if row.absolute)
 
     def hint(self, m: Measurement, datum: Datum) -> Hint:
         """Return what a measurement says by itself."""

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from graphloc.build import make_problem
+from graphloc.build import make_problem, rows_of
 from graphloc.config import VesselConfig
 from graphloc.frames import Datum
 from graphloc.graph import InertialRow, Sensor
@@ -74,7 +74,7 @@ def smooth(
 
     imu = config.of_kind(inertial.kind).values()
     bridge_s = min((sensor.max_bridge_s for sensor in imu), default=np.inf)
-    absolute = {name for row in rows if row.absolute for name in config.of_kind(row.kind)}
+    absolute = {name for name, row in rows_of(config, rows).items() if row.absolute}
     leg_s = config.timeline.leg_s
     return _on_deep_stack(lambda: solve_parts(recording, bridge_s, leg_s, absolute, solve))
 

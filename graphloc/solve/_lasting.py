@@ -55,12 +55,15 @@ def lasting_error(t_s: Array, residuals: Array) -> Lasting | None:
         t_s: (N,) when. residuals: (N, k), m.
     """
     n = len(residuals)
-    variance = float((residuals**2).mean())
-    if not variance:
+    # What they have in common throughout is no error that lasts for a while: a datum or a mount.
+    off = residuals - residuals.mean(axis=0)
+    variance = (off**2).mean(axis=0)
+    if not variance.all():
         return None
+    off = off / np.sqrt(variance)
 
     def correlation(lag: int) -> float:
-        return float((residuals[lag:] * residuals[: n - lag]).mean()) / variance
+        return float((off[lag:] * off[: n - lag]).mean())
 
     first = correlation(1)
     if first < max(_LEAST, _SURE / np.sqrt(residuals.size)):
@@ -68,4 +71,4 @@ def lasting_error(t_s: Array, residuals: Array) -> Lasting | None:
     for lag in np.unique(np.geomspace(2, n // 3, 60).astype(int)):
         if correlation(int(lag)) < first / np.e:
             break
-    return Lasting(float(np.sqrt(first * variance)), float(np.median(t_s[lag:] - t_s[: n - lag])))
+    return Lasting(float(np.sqrt(first * variance.mean())), float(np.median(t_s[lag:] - t_s[: n - lag])))
