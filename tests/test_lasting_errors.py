@@ -165,7 +165,9 @@ def test_errors_that_last_are_said_with_their_size_and_time() -> None:
 @pytest.mark.parametrize("number", [40, 1000])
 def test_independent_errors_are_not_said_to_last(number: int) -> None:
     for seed in range(50):
-        residuals = np.random.default_rng(seed).normal(0.0, 1.0, (number, 2)) + [3.0, 0.0]  # a datum is off throughout
+        residuals = np.random.default_rng(seed).normal(0.0, 1.0, (number, 2)) + np.array(
+            [3.0, 0.0]
+        )  # a datum is off throughout
         assert lasting_error(np.arange(float(number)), residuals) is None
 
 
