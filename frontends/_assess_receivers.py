@@ -13,6 +13,7 @@ from graphloc.frontends._assess import track
 from graphloc.frontends._clock import MOST_LATE_S
 from graphloc.frontends._reports import GnssReport
 from graphloc.frontends._streams import TopicData
+from graphloc.frozen_receiver import frozen_fixes
 from graphloc.series import interpolated
 from graphloc.time import NS_PER_S
 
@@ -31,8 +32,8 @@ def apart_m(first: GnssReport, second: GnssReport, fixes: TopicData, others: Top
     Args:
         first, second: their reports. fixes, others: their streams.
     """
-    at, _, rows = track(fixes)
-    there, _, other_rows = track(others)
+    at, rows = _moving(fixes)
+    there, other_rows = _moving(others)
     if min(len(at), len(there)) < _FEWEST:
         return None
     datum = Datum(Geodetic(*rows[0, :3]))
@@ -53,6 +54,13 @@ def apart_m(first: GnssReport, second: GnssReport, fixes: TopicData, others: Top
     variance = min(map(variance_m2, np.arange(-MOST_LATE_S, MOST_LATE_S + 0.5 * _LAG_S, _LAG_S)))
     white = sum(max(r.scatter_m[:2]) ** 2 for r in (first, second) if r.scatter_m)
     return math.sqrt(max(variance - white, 0.0))
+
+
+def _moving(fixes: TopicData) -> tuple[NDArray[np.int64], Array]:
+    """Return stamps (N,) and rows of the good fixes, without those of a frozen receiver: they would count the vessel's way as wander."""
+    stamps_ns, p_m, rows = track(fixes)
+    good = ~frozen_fixes(stamps_ns, rows[:, :2], p_m[:, :2])
+    return stamps_ns[good], rows[good]
 
 
 def _steadily(t: Array, other_t: Array) -> NDArray[np.bool_]:

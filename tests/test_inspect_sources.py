@@ -515,6 +515,21 @@ def test_a_gap_of_one_receiver_is_no_wander(silent: str, tmp_path: Path) -> None
     assert {s.slow_error.horizontal_sigma_m for s in config.of_kind("gnss").values()} == {2.0}
 
 
+@pytest.mark.parametrize("held", ["/fix", "/cheap/fix"])
+def test_a_receiver_that_freezes_for_a_while_is_no_wander(held: str, tmp_path: Path) -> None:
+    """Its fixes are rejected; the way that the other one went meanwhile made a slow error of tens of metres of them."""
+    make, last = Messages(2), None
+    items = two_receivers(make, lambda t, _yaw: np.zeros((len(t), 3)), claims_m=1.0, height=True)
+    for topic, log_ns, message in items:
+        if topic == held and 40 * S < log_ns - START_NS < 60 * S:
+            last = last or message
+            message.latitude, message.longitude = last.latitude, last.longitude
+    found, config, _ = look(tmp_path, items, make)
+    assert any(held in line and "frozen receiver" in line for line in found.warnings)
+    assert not any("wander against each other" in line for line in found.warnings)
+    assert {s.slow_error.horizontal_sigma_m for s in config.of_kind("gnss").values()} == {2.0}
+
+
 @pytest.mark.parametrize("keeps", [1.0, 0.985], ids=["a constant", "smoothed"])
 def test_hills_that_another_receiver_does_not_show_are_no_drift(keeps: float, tmp_path: Path) -> None:
     """Of a driver that fills in 0, or a filter over 13 s: the better receiver's hills were taken for its drift, and it was switched off."""
