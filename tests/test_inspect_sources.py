@@ -484,6 +484,22 @@ def test_two_antennas_on_a_ship_do_not_wander_against_each_other(tmp_path: Path)
     found, config, _ = look(tmp_path, two_receivers(make, antenna, claims_m=1.0, height=True), make)
     assert not any("wander against each other" in line for line in found.warnings)
     assert {s.slow_error.horizontal_sigma_m for s in config.of_kind("gnss").values()} == {2.0}
+    # Neither antenna's place was taken to be off by more than a metre: the track was up to 20 m off, in bounds of 5 m.
+    assert all(10.0 < s.mount_sigma_m < 16.0 for s in config.of_kind("gnss").values())
+
+
+def test_a_late_receiver_of_one_antenna_tells_no_distance(tmp_path: Path) -> None:
+    """Straight on, at 10 m/s, it looks like an antenna 4 m further back."""
+    make = Messages(2)
+    items = two_receivers(make, lambda t, _yaw: np.zeros((len(t), 3)), claims_m=1.0, height=True)
+    for topic, log_ns, message in items:
+        if topic in ("/fix", "/cheap/fix"):
+            at_ns = log_ns + (400_000_000 if topic == "/cheap/fix" else 0)
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(at_ns, S)
+            message.latitude = 58.0 + 10.0 * (log_ns - START_NS) / S / 111e3
+            message.longitude = 11.0
+    _, config, _ = look(tmp_path, items, make)
+    assert {s.mount_sigma_m for s in config.of_kind("gnss").values()} == {1.0}
 
 
 @pytest.mark.parametrize(("claims_m", "scatter_m", "slow_m"), [(6.0, 0.3, 6.0), (6.0, 6.0, 2.0), (1.0, 0.1, 2.0)])
