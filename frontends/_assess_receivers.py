@@ -25,14 +25,14 @@ _WITHOUT = 0.1  # share of fixes without a height, from which the others tell no
 _NORMAL_90 = 3.29  # sigmas from the 5 % point to the 95 % point
 
 
-class Apart(NamedTuple):
+class TwoAntennas(NamedTuple):
     """Of two receivers: by how much they wander against each other, m, 1 sigma of an axis; and how far apart their antennas are at least, m."""
 
     wander_m: float
     keeps_m: float
 
 
-def apart(first: GnssReport, second: GnssReport, fixes: TopicData, others: TopicData) -> Apart | None:
+def apart(first: GnssReport, second: GnssReport, fixes: TopicData, others: TopicData) -> TwoAntennas | None:
     """Return by how much two receivers wander against each other, their white noise left out, and keep apart; None if nothing tells.
 
     By the distance between them, which two antennas keep, however the craft turns; one may be stamped later than the other. Of a
@@ -64,7 +64,7 @@ def apart(first: GnssReport, second: GnssReport, fixes: TopicData, others: Topic
 
     variances, distances = zip(*map(varies, np.arange(-MOST_LATE_S, MOST_LATE_S + 0.5 * _LAG_S, _LAG_S)), strict=True)
     white = sum(max(r.scatter_m[:2]) ** 2 for r in (first, second) if r.scatter_m)
-    return Apart(math.sqrt(max(min(variances) - white, 0.0)), min(distances))
+    return TwoAntennas(math.sqrt(max(min(variances) - white, 0.0)), min(distances))
 
 
 def _moving(fixes: TopicData) -> tuple[NDArray[np.int64], Array]:
