@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from graphloc.frontends._assess import track
 from graphloc.frontends._clock import MOST_LATE_S
 from graphloc.frontends._reports import GnssReport
 from graphloc.frontends._streams import TopicData
+from graphloc.frozen_receiver import frozen_fixes
 from graphloc.series import interpolated
 from graphloc.time import NS_PER_S
 
@@ -23,16 +25,24 @@ _WITHOUT = 0.1  # share of fixes without a height, from which the others tell no
 _NORMAL_90 = 3.29  # sigmas from the 5 % point to the 95 % point
 
 
-def apart_m(first: GnssReport, second: GnssReport, fixes: TopicData, others: TopicData) -> float | None:
-    """Return by how much two receivers wander against each other, m, 1 sigma of an axis, their white noise left out; None if nothing tells.
+class TwoAntennas(NamedTuple):
+    """Of two receivers: by how much they wander against each other, m, 1 sigma of an axis; and how far apart their antennas are at least, m."""
 
-    By the distance between them, which two antennas keep, however the craft turns; one may be stamped later than the other.
+    wander_m: float
+    keeps_m: float
+
+
+def apart(first: GnssReport, second: GnssReport, fixes: TopicData, others: TopicData) -> TwoAntennas | None:
+    """Return by how much two receivers wander against each other, their white noise left out, and keep apart; None if nothing tells.
+
+    By the distance between them, which two antennas keep, however the craft turns; one may be stamped later than the other. Of a
+    craft that goes straight on a late stamp looks like an antenna further back: hence the least distance that such a stamp leaves.
 
     Args:
         first, second: their reports. fixes, others: their streams.
     """
-    at, _, rows = track(fixes)
-    there, _, other_rows = track(others)
+    at, rows = _moving(fixes)
+    there, other_rows = _moving(others)
     if min(len(at), len(there)) < _FEWEST:
         return None
     datum = Datum(Geodetic(*rows[0, :3]))
@@ -43,16 +53,25 @@ def apart_m(first: GnssReport, second: GnssReport, fixes: TopicData, others: Top
         return None
     t, p = t[inside], p[inside]
 
-    def variance_m2(lag_s: float) -> float:
+    def varies(lag_s: float) -> tuple[float, float]:
+        """Return the variance, m^2, and the distance that they keep, m; 0 where they do not."""
         beside = interpolated(t + lag_s, other_t, q)
-        apart = np.hypot(*(p - beside).T)
+        distance = np.hypot(*(p - beside).T)
         # Two antennas far from each other are never near each other: then only what their distance varies by is error.
-        lever = float(np.percentile(apart, 5)) > _NEVER_NEAR * float(np.sqrt((apart**2).mean()))
-        return float(apart.var() if lever else 0.5 * (apart**2).mean())
+        near = float(np.percentile(distance, 5))
+        lever = near > _NEVER_NEAR * float(np.sqrt((distance**2).mean()))
+        return (float(distance.var()), near) if lever else (0.5 * float((distance**2).mean()), 0.0)
 
-    variance = min(map(variance_m2, np.arange(-MOST_LATE_S, MOST_LATE_S + 0.5 * _LAG_S, _LAG_S)))
+    variances, distances = zip(*map(varies, np.arange(-MOST_LATE_S, MOST_LATE_S + 0.5 * _LAG_S, _LAG_S)), strict=True)
     white = sum(max(r.scatter_m[:2]) ** 2 for r in (first, second) if r.scatter_m)
-    return math.sqrt(max(variance - white, 0.0))
+    return TwoAntennas(math.sqrt(max(min(variances) - white, 0.0)), min(distances))
+
+
+def _moving(fixes: TopicData) -> tuple[NDArray[np.int64], Array]:
+    """Return stamps (N,) and rows of the good fixes, without those of a frozen receiver: they would count the vessel's way as wander."""
+    stamps_ns, p_m, rows = track(fixes)
+    good = ~frozen_fixes(stamps_ns, rows[:, :2], p_m[:, :2])
+    return stamps_ns[good], rows[good]
 
 
 def _steadily(t: Array, other_t: Array) -> NDArray[np.bool_]:

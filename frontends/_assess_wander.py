@@ -27,6 +27,7 @@ _BEYOND = 2.0  # times the variance by default, from which the changes say that 
 _USUAL_S, _WITHIN, _WITHIN_S = 100.0, 2.5, 3.0
 _DEPENDENT = 0.5  # share of the weight that changes over several spans of one run have, as they are made of each other
 _SIGMAS = np.geomspace(0.25, 32.0, 78)  # times the sigma by default; one is 1
+_DRIFTS_RADPS = np.linspace(-0.02, 0.02, 41)  # of the heading of wheels; a gyroscope's bias at most
 _TIMES_S = np.geomspace(5.0, 600.0, 50)
 
 
@@ -35,8 +36,8 @@ def changes(
 ) -> tuple[Change, ...]:
     """Return by how much the error of fixes changes along the way within each of `SPANS_S`; none where that is not told.
 
-    By a velocity to the east and north: of chords. By wheels: of their lengths, so that no heading is needed; the scale is the median's.
-    Ways of wheels, or of an integrated velocity, drift little in so short times; and jumps, of which there are few, hardly count.
+    By a velocity to the east and north: of chords. By wheels: of their lengths, so that no heading is needed; the scale is the median's,
+    and their heading may drift steadily. Ways of wheels, or of an integrated velocity, drift little in so short times; and jumps, of which there are few, hardly count.
 
     Args:
         motion: with a way. stamps_ns: (N,) of the fixes. p_m: (N, 3), east, north, up. scatter_m: noise of each, 1 sigma of an axis.
@@ -52,28 +53,57 @@ def changes(
     t, p = t[inside], p_m[inside, :2]
     moved_m = interpolated(t, at, np.column_stack([motion.way_m.real, motion.way_m.imag]))
     period_s = float(np.median(np.diff(t)))
+    if turned:
+        moved_m = _steered(t, p, moved_m)
     found, told = [], False
     for span_s in SPANS_S:
-        end = np.searchsorted(t, t + span_s)
-        begin = np.flatnonzero(end < len(t))
-        begin = begin[t[end[begin]] - t[begin] < 1.5 * span_s]  # not across an outage
-        fixed, chord = (way[end[begin]] - way[begin] for way in (p, moved_m))
-        length = np.hypot(*chord.T)
-        moved = length > _LEAST_M
-        moves_s = np.count_nonzero(moved) * period_s
+        fixed, chord = _chords(t, p, moved_m, span_s)
+        moves_s = len(chord) * period_s
         if moves_s + span_s < max(_SHORTEST_S, _FEWEST * span_s):
             continue
-        fixed, chord, length = fixed[moved], chord[moved], length[moved]
-        off = fixed - chord
-        if turned:
-            fixed_m = np.hypot(*fixed.T)
-            off = fixed_m - np.median(fixed_m / length) * length
-            off = off - np.median(off)
-        sigma = rms(robust_sigma(off))
-        told |= sigma >= (_SLIP if turned else _DOPPLER) * float(np.median(length))
+        sigma = rms(robust_sigma(_longer(fixed, chord) if turned else fixed - chord))
+        told |= sigma >= (_SLIP if turned else _DOPPLER) * float(np.median(np.hypot(*chord.T)))
         seen = (1 if turned else 2) * (moves_s + span_s) / span_s
         found.append(Change(span_s, float(np.sqrt(max(sigma**2 - 2.0 * scatter_m**2, 0.0))), seen))
     return tuple(found) if told else ()
+
+
+def _chords(t_s: Array, p_m: Array, moved_m: Array, span_s: float) -> tuple[Array, Array]:
+    """Return the chords (N, 2) of two ways (K, 2) over so many seconds, not across an outage, of which the latter are no mere error."""
+    end = np.searchsorted(t_s, t_s + span_s)
+    begin = np.flatnonzero(end < len(t_s))
+    begin = begin[t_s[end[begin]] - t_s[begin] < 1.5 * span_s]
+    fixed, chord = (way[end[begin]] - way[begin] for way in (p_m, moved_m))
+    moved = np.hypot(*chord.T) > _LEAST_M
+    return fixed[moved], chord[moved]
+
+
+def _longer(fixed_m: Array, chord_m: Array) -> Array:
+    """Return by how much chords of fixes (N, 2) are longer than those of wheels (N, 2), whose scale is the median's, beyond the median, m."""
+    fixed, chord = np.hypot(*fixed_m.T), np.hypot(*chord_m.T)
+    off = fixed - np.median(fixed / chord) * chord
+    return np.asarray(off - np.median(off))
+
+
+def _steered(t_s: Array, p_m: Array, moved_m: Array) -> Array:
+    """Return the way of wheels (N, 2) without the steady drift of its heading: that without which its chords are most as long as the fixes'.
+
+    A drift of 0.2 deg/s turns a way by 16 deg in 80 s: where the craft turned meanwhile, chords of 500 m are then tens of metres off.
+    """
+    steps = np.diff(moved_m @ np.array([1.0, 1j]), prepend=0.0)
+    some = np.s_[:: max(1, round(1.0 / max(float(np.median(np.diff(t_s))), 1e-3)))]  # one a second tells as much
+
+    def way_m(drift_radps: float) -> Array:
+        z = np.cumsum(steps * np.exp(-1j * drift_radps * (t_s - t_s[0])))
+        return np.column_stack([z.real, z.imag])
+
+    def misfit(drift_radps: float) -> float:
+        own_m = way_m(drift_radps)[some]
+        chords = [(span_s, *_chords(t_s[some], p_m[some], own_m, span_s)) for span_s in SPANS_S]
+        # A wandering error changes with the root of the span.
+        return float(sum(robust_sigma(_longer(a, b)) / np.sqrt(span_s) for span_s, a, b in chords if len(a)))
+
+    return way_m(min(_DRIFTS_RADPS, key=lambda drift: (misfit(drift), abs(drift))))
 
 
 def slow_error_by(wander: Sequence[Change], sigma_m: float) -> tuple[float, float] | None:

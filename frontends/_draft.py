@@ -299,7 +299,7 @@ def _other_block(name: str, gnss: GnssReport, others: PartOfFixes, *, enabled: b
         "  fixes: other  # those without RTK: a sensor of its own, whose error is slow",
         *_topic_lines(gnss.topic),
         *([] if enabled else [f"  enabled: false  # guess: as {name}"]),
-        *_antenna_lines(gnss.tf_frame, "from tf"),
+        *_antenna_lines(gnss.tf_frame, "from tf", gnss.keeps_m),
         *_scatter_lines(own),
         *([_wandering(gnss)] if wanders else []),
         f"  slow_error: {{{keys}}}  # guess: as large as floats claim, metres of what is none, and other from minute to minute",
@@ -330,7 +330,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         lines.append(f"  enabled: false  # guess: {why}")
     else:
         lines += _filtered_lines(gnss.topic)
-    lines += _antenna_lines(gnss.tf_frame, "from tf")
+    lines += _antenna_lines(gnss.tf_frame, "from tf", gnss.keeps_m)
     lines += _scatter_lines(_of_part(gnss, gnss.by_turns[0]) if gnss.by_turns else gnss)
     lines += _rtk_lines(gnss)
     lines += _uneven_lines(gnss)
@@ -491,15 +491,18 @@ def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None, o
         lines.append("  convention: ned  # guess: by the GNSS track")
     frame = twist.tf_frame or (gnss.tf_frame if gnss else None)
     evidence = "from tf" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
-    return [*lines, *_antenna_lines(frame, evidence)]
+    return [*lines, *_antenna_lines(frame, evidence, gnss.keeps_m if gnss else 0.0)]
 
 
-def _antenna_lines(frame: str | None, evidence: str) -> list[str]:
+def _antenna_lines(frame: str | None, evidence: str, keeps_m: float) -> list[str]:
+    """Return where an antenna sits. Of two that keep their distance one is half of it, or more, from anywhere."""
     if frame is not None:
         return [f"  mount: {{tf_frame: {json.dumps(frame)}}}  # {evidence}"]
+    off_m = max(_ANTENNA_OFF_M, keeps_m / 2.0)
+    far = f": two antennas keep {keeps_m:.0f} m apart" if off_m > _ANTENNA_OFF_M else ""
     return [
         "  mount: {xyz_m: [0.0, 0.0, 0.0]}  # guess: where the antenna sits is not in the bag; measure it",
-        f"  mount_sigma_m: {_ANTENNA_OFF_M}  # guess: how far off that may be; estimated with the run; 0 once it is measured",
+        f"  mount_sigma_m: {off_m:.1f}  # guess: how far off that may be{far}; estimated with the run; 0 once it is measured",
     ]
 
 

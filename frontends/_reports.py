@@ -152,6 +152,7 @@ class GnssReport:
         wander: by how much their error changes along the way, by `wander_by`, wheels or a velocity; empty where these do not tell.
         uneven: how unevenly its fixes are stamped; None where these tell when each was measured.
         apart_m: by how much it and `apart_from`, the receiver it agrees with best, wander against each other, 1 sigma of an axis.
+        keeps_m: how far its antenna and that of another receiver are apart at least; 0 where nothing tells.
         by_turns: the fixes of RTK, by their status and what they state, and the others, where both come.
         without_height: fixes without one. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
@@ -182,6 +183,7 @@ class GnssReport:
     uneven: Uneven | None = None
     apart_m: float = 0.0
     apart_from: str = ""
+    keeps_m: float = 0.0
     by_turns: tuple[PartOfFixes, PartOfFixes] | None = None
 
     @property

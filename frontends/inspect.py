@@ -32,7 +32,7 @@ from graphloc.frontends._assess import (
 )
 from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
 from graphloc.frontends._assess_imu import felt_of, imu_report, series_of
-from graphloc.frontends._assess_receivers import apart_m, apart_warning, height_wanders_m
+from graphloc.frontends._assess_receivers import apart, apart_warning, height_wanders_m
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_wander import changes, way_of
 from graphloc.frontends._assess_world import in_map_grid, world_of
@@ -328,16 +328,17 @@ def _octave(gnss: GnssReport, level_m: float, *, claimed: bool) -> int:
 
 
 def _beside_others(gnss: GnssReport, rivals: Sequence[GnssReport], bag: _Contents) -> GnssReport:
-    """Return the report with by how much it and the other receiver that it agrees with best wander against each other."""
-    apart = {
-        other.topic: m
+    """Return the report with by how much it and the other receiver that it agrees with best wander against each other, and how far off others sit."""
+    beside = {
+        other.topic: found
         for other in rivals
         if other.topic != gnss.topic
-        and (m := apart_m(gnss, other, bag.aligned[gnss.topic], bag.aligned[other.topic])) is not None
-        and m > _SAME_M
+        and (found := apart(gnss, other, bag.aligned[gnss.topic], bag.aligned[other.topic])) is not None
     }
-    nearest = min(apart, key=lambda topic: apart[topic], default="")
-    return replace(gnss, apart_m=apart[nearest], apart_from=nearest) if nearest else gnss
+    gnss = replace(gnss, keeps_m=max((found.keeps_m for found in beside.values()), default=0.0))
+    wander = {topic: found.wander_m for topic, found in beside.items() if found.wander_m > _SAME_M}
+    nearest = min(wander, key=lambda topic: wander[topic], default="")
+    return replace(gnss, apart_m=wander[nearest], apart_from=nearest) if nearest else gnss
 
 
 def _odometry_reports(

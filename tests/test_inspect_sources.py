@@ -484,6 +484,22 @@ def test_two_antennas_on_a_ship_do_not_wander_against_each_other(tmp_path: Path)
     found, config, _ = look(tmp_path, two_receivers(make, antenna, claims_m=1.0, height=True), make)
     assert not any("wander against each other" in line for line in found.warnings)
     assert {s.slow_error.horizontal_sigma_m for s in config.of_kind("gnss").values()} == {2.0}
+    # Neither antenna's place was taken to be off by more than a metre: the track was up to 20 m off, in bounds of 5 m.
+    assert all(10.0 < s.mount_sigma_m < 16.0 for s in config.of_kind("gnss").values())
+
+
+def test_a_late_receiver_of_one_antenna_tells_no_distance(tmp_path: Path) -> None:
+    """Straight on, at 10 m/s, it looks like an antenna 4 m further back."""
+    make = Messages(2)
+    items = two_receivers(make, lambda t, _yaw: np.zeros((len(t), 3)), claims_m=1.0, height=True)
+    for topic, log_ns, message in items:
+        if topic in ("/fix", "/cheap/fix"):
+            at_ns = log_ns + (400_000_000 if topic == "/cheap/fix" else 0)
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(at_ns, S)
+            message.latitude = 58.0 + 10.0 * (log_ns - START_NS) / S / 111e3
+            message.longitude = 11.0
+    _, config, _ = look(tmp_path, items, make)
+    assert {s.mount_sigma_m for s in config.of_kind("gnss").values()} == {1.0}
 
 
 @pytest.mark.parametrize(("claims_m", "scatter_m", "slow_m"), [(6.0, 0.3, 6.0), (6.0, 6.0, 2.0), (1.0, 0.1, 2.0)])
@@ -511,6 +527,21 @@ def test_a_gap_of_one_receiver_is_no_wander(silent: str, tmp_path: Path) -> None
     items = two_receivers(make, lambda t, _yaw: np.zeros((len(t), 3)), claims_m=1.0, height=True)
     kept = [item for item in items if item[0] != silent or not 40 * S < item[1] - START_NS < 80 * S]
     found, config, _ = look(tmp_path, kept, make)
+    assert not any("wander against each other" in line for line in found.warnings)
+    assert {s.slow_error.horizontal_sigma_m for s in config.of_kind("gnss").values()} == {2.0}
+
+
+@pytest.mark.parametrize("held", ["/fix", "/cheap/fix"])
+def test_a_receiver_that_freezes_for_a_while_is_no_wander(held: str, tmp_path: Path) -> None:
+    """Its fixes are rejected; the way that the other one went meanwhile made a slow error of tens of metres of them."""
+    make, last = Messages(2), None
+    items = two_receivers(make, lambda t, _yaw: np.zeros((len(t), 3)), claims_m=1.0, height=True)
+    for topic, log_ns, message in items:
+        if topic == held and 40 * S < log_ns - START_NS < 60 * S:
+            last = last or message
+            message.latitude, message.longitude = last.latitude, last.longitude
+    found, config, _ = look(tmp_path, items, make)
+    assert any(held in line and "frozen receiver" in line for line in found.warnings)
     assert not any("wander against each other" in line for line in found.warnings)
     assert {s.slow_error.horizontal_sigma_m for s in config.of_kind("gnss").values()} == {2.0}
 
