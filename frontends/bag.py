@@ -60,7 +60,7 @@ from graphloc.frontends.decode import (
 )
 from graphloc.frontends.vendors import VENDORS
 from graphloc.ledger import LedgerRow, Outcome
-from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix
+from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix
 from graphloc.recording import Mounts, Progress, Recording, Span
 from graphloc.time import NS_PER_S
 
@@ -116,6 +116,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
         _refuse_unit(imu, sensors)
         warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, sensors, mounts, config)
     warnings += _silent(sensors, rows, topics, config) + _unstamped(sensors, topics) + _heightless(sensors, config)
+    warnings += _along_fewer(sensors)
     warnings += [
         f"{b.topic}: {b.unstamped} of its headers hold no stamp: recording times are used"
         for b in (truth, check)
@@ -376,6 +377,20 @@ def _heightless(sensors: Sequence[Readings], config: VesselConfig) -> list[str]:
     return [
         f"{said}: enable a sensor of kind height (a vessel that floats), or put z among the axes of poses whose height is right"
     ]
+
+
+def _along_fewer(sensors: Sequence[Readings]) -> list[str]:
+    """Say which of its axes a speed does not tell: a number and VHW are one ahead, and say nothing of drift."""
+    lines = []
+    for readings in sensors:
+        if isinstance(readings.config, BodyVelocityConfig) and readings.values:
+            told = {axis for value in readings.values if isinstance(value, BodyVelocity) for axis in value.axes}
+            if missing := [axis for axis in readings.config.axes if axis not in told]:
+                lines.append(
+                    f"{readings.sensor}: its messages tell {' and '.join(sorted(told))} alone, not {' and '.join(missing)} of its axes: "
+                    "wheels that do not slip sideways are fused as such from a Twist or an Odometry"
+                )
+    return lines
 
 
 def _silent(

@@ -1,10 +1,11 @@
 """Velocity along the vessel: what messages say, what the factor makes of it, and what it is worth while GNSS is silent."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import gtsam
 import numpy as np
@@ -21,8 +22,9 @@ from graphloc.eval.simulate.bag import write_bag
 from graphloc.factors import KINDS
 from graphloc.factors.body_velocity import residuals
 from graphloc.frames import Datum, Geodetic
+from graphloc.frontends._readings import Readings
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends.bag import read_recording
+from graphloc.frontends.bag import _along_fewer, read_recording
 from graphloc.frontends.decode import DECODERS, NUMBERS, VECTOR
 from graphloc.frontends.lines import Trouble, parse
 from graphloc.graph import Attachment
@@ -190,6 +192,31 @@ def test_the_batch_finds_where_wheels_sit_and_how_they_are_turned() -> None:
     assert np.abs(away).max() < 3.0
     assert slow.sigma[-1][1] < 0.3  # m, of 1.5 to begin with
     assert slow.sigma[-1][4] < 1.0  # deg, of 2
+
+
+def test_a_wrong_unit_is_named_and_no_mount() -> None:
+    """Kilometres an hour, read as metres a second."""
+    scenario = Scenario(path="loops", duration_s=60.0, gnss_hz=2.0, pose_hz=0.0, log_hz=2.0, log_through="ground")
+    run = simulate_slowly(scenario, 3)
+
+    def faster(m: Any) -> Any:
+        return replace(m, value=3.6 * m.value) if isinstance(m, BodyVelocity) else m
+
+    found = app.simulated(replace(run, recording=run.recording.changed(faster)), compare=False).solution
+    (line,) = (said for said in found.stats.warnings if said.startswith("log: its speed error"))
+    times = re.search(r"it reads ([\d.]+) times the speed: check its unit", line)
+    assert times
+    assert float(times[1]) == pytest.approx(3.6, rel=0.1)
+    assert "mount" not in line
+
+
+def test_axes_that_its_messages_do_not_tell_are_named() -> None:
+    values = [decode(SimpleNamespace(data=4.0), configured(axes=["x", "y"]), NUMBERS[0])]
+    for axes, said in ((["x", "y"], ["not y of its axes"]), (["x"], [])):
+        readings = SimpleNamespace(sensor="wheels", config=configured(axes=axes), values=values)
+        lines = _along_fewer([cast("Readings", readings)])
+        assert len(lines) == len(said)
+        assert all(text in line for text, line in zip(said, lines, strict=True))
 
 
 def test_the_better_filter_takes_it_and_the_thesis_says_why_not() -> None:

@@ -96,7 +96,7 @@ def joint_rejection_warning(sensor: str, stamps_ns: NDArray[np.int64], weights: 
 
 
 def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
-    """How many of its sigmas a constant slow state (a mount's offset) lies from zero, 0 where there is none; which, and where."""
+    """How many of its sigmas a constant slow state (a mount's offset) lies from zero, 0 where there is none; which, where, and what to do."""
     slow = stream.slow
     if slow is None:
         return 0.0, ""
@@ -106,7 +106,10 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
         far[slow.late] = 0.0  # it is no mount (`late_far_off`)
     k = int(np.argmax(far))
     where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.3g} {slow.units[k]}"
-    return float(far[k]), f"its {slow.offset or slow.name} is estimated {far[k]:.1f} sigmas ({where})"
+    cure = "check its mount and the IMU's, or raise the configured sigma"
+    if slow.axes[k] == "scale":
+        cure = f"it reads {1.0 + value[k]:.2f} times the speed: check its unit and calibration, or raise scale_sigma"
+    return float(far[k]), f"its {slow.offset or slow.name} is estimated {far[k]:.1f} sigmas ({where}) from zero: {cure}"
 
 
 def _turned_mount(stream: Stream, result: BatchResult) -> list[str]:
@@ -288,9 +291,7 @@ def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     warnings = list[str]()
     far, said = _far_from_prior(stream, result)
     if far > FAR_OFF:
-        warnings.append(
-            f"{stream.name}: {said} from zero: check its mount and the IMU's, or raise the configured sigma"
-        )
+        warnings.append(f"{stream.name}: {said}")
     else:
         warnings += _turned_mount(stream, result)
     warnings += late_far_off(stream.name, stream.slow, late_of(stream, result.values) or 0.0)
