@@ -31,9 +31,10 @@ def telling(held: Sequence[GnssPosition], config: VesselConfig) -> tuple[GnssPos
 
     The others are off by metres themselves, which would be all that is seen.
     """
-    rtk = {m.sensor for m in held if config.sensors[m.sensor].fixes == "rtk"}
-    worse = {m.sensor for m in held if config.sensors[m.sensor].fixes == "other"}
-    worse = {name for name in worse if rtk.intersection(config.by_turns(name))}
+    # Fixes may also be of a kind that is not in the package, or of a sensor that is not in the configuration.
+    turns = {m.sensor for m in held if m.sensor in config.sensors and config.sensors[m.sensor].takes_turns}
+    rtk = {name for name in turns if config.sensors[name].fixes == "rtk"}
+    worse = {name for name in turns - rtk if rtk.intersection(config.by_turns(name))}
     return tuple(m for m in held if m.sensor not in worse)
 
 

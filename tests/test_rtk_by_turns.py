@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 
 from graphloc import app
 from graphloc.build import shared_constants
-from graphloc.config import GnssConfig, SlowErrorConfig, VesselConfig
+from graphloc.config import GnssConfig, SensorConfig, SlowErrorConfig, VesselConfig
 from graphloc.eval.drill import script
 from graphloc.eval.ekf import run_honest
 from graphloc.eval.holdout import HoldOut, telling
@@ -127,6 +127,22 @@ def test_held_out_fixes_without_rtk_measure_nothing() -> None:
     without = two.recording.where(lambda m: m.sensor != "gnss")
     _, left = HoldOut(every=5).split(without)
     assert telling(left, two.config) == left  # where there is nothing better
+
+
+def test_held_out_fixes_of_other_kinds_and_of_no_sensor_are_told_from_none() -> None:
+    """A kind of another package reads no fixes by turns, and says nothing of that."""
+
+    class Loran(SensorConfig):
+        """Fixes of a kind that is not in the package."""
+
+        kind: Literal["loran"] = "loran"
+
+    _, two = receiver(comes_and_goes, lambda _t: (0.0, 0.0))
+    _, held = HoldOut(every=5).split(two.recording)
+    others = tuple(replace(m, sensor=name) for m, name in zip(held, ("loran", "gone"), strict=False))
+    config = two.config.with_sensors({"loran": Loran(topic="/loran")})
+    assert telling(others, config) == others
+    assert {m.sensor for m in telling((*held, *others), config)} == {"gnss", "loran", "gone"}
 
 
 def test_a_receiver_that_hangs_repeats_what_it_said_last_with_rtk_or_without() -> None:
