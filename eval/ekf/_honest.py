@@ -37,13 +37,14 @@ class _HonestEkf:
         self._agreed_ns: dict[str, int] = {}
         self._recent: deque[Array] = deque(maxlen=round(_MEAN_S * _RATE_HZ))  # accelerations without those of turning
         self._sum = np.zeros(2)  # of these
+        self._rate = 0.0  # of the last step, rad/s
 
     def start(self, x: Array) -> tuple[Array, Array]:
         return np.append(x, 0.0), np.diag([1.0, 1.0, 1.0, 1.0, np.radians(5.0) ** 2, np.radians(0.5) ** 2])
 
     def predict(self, x: Array, P: Array, step: Interval) -> tuple[Array, Array]:
         # In a turn the body's axes rotate under its velocity: dv/dt = a - w x v, which the print leaves out.
-        rate = step.rate - x[5]
+        rate = self._rate = step.rate - x[5]
         turning = rate * np.array([x[3], -x[2]])
         bias = self._mean_with(step.accel + turning)
         F = np.eye(6)
@@ -92,14 +93,18 @@ class _HonestEkf:
         assert isinstance(log, BodyVelocityConfig)
         slow = (log.scale_sigma * m.value[:size]) ** 2
         slow += log.current_sigma_mps**2 if log.through == "water" else 0.0
-        return np.diag(slow) * per_s
+        slow += (self._rate * log.mount_sigma_m) ** 2
+        along = dict(zip(m.axes, m.value, strict=True))
+        turned = {"x": along.get("y", 0.0), "y": -along.get("x", 0.0)}
+        by_yaw = np.radians(log.mount_sigma_deg) * np.array([turned[axis] for axis in m.axes if axis in turned])
+        return (np.diag(slow) + np.outer(by_yaw, by_yaw)) * per_s
 
 
 def run_honest(recording: Recording, config: VesselConfig, datum: Datum) -> FilterResult:
     """Run an EKF for a fair comparison.
 
     Exact Jacobian, rotating body axes, gyro bias as a state, wave accelerations as process noise, GNSS velocity, a 90 % chi-square
-    gate for every sensor, a GNSS covariance that includes slow errors (1 m), that of poses their `slow_error`, and a speed log's scale and current.
+    gate for every sensor, a GNSS covariance that includes slow errors (1 m), that of poses their `slow_error`, and a speed log's scale, current and mount.
     While measurements are rejected the covariance grows, so the gate opens again by itself; a sensor that was rejected for 10 s is
     accepted again, so that nothing locks it out. The three values were chosen on seeds that no figure uses
     (`benchmarks/tune_filter.py`).
