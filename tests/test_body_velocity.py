@@ -16,12 +16,12 @@ from graphloc import app
 from graphloc.blocks import MountConfig
 from graphloc.config import BodyVelocityConfig, load_config, parse_config
 from graphloc.eval import ekf
-from graphloc.eval.metrics import TruthMetrics, compare_to_truth
+from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.factors import KINDS
 from graphloc.factors.body_velocity import residuals
-from graphloc.frames import Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._readings import Readings
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends.bag import _along_fewer, read_recording
@@ -206,37 +206,34 @@ def test_the_better_filter_is_told_that_the_mount_of_wheels_is_not_known() -> No
     run = simulate_slowly(scenario, 7)
     recording = on_wheels(run, -3.0, 4.0)
 
-    def numbers(**unknown: float) -> TruthMetrics:
+    def rmse_and_nees(**unknown: float) -> Array:
         config = run.config.with_sensors({"log": configured(topic="/log", axes=["x", "y"], **unknown)})
         track = ekf.run_honest(recording, config, app.choose_datum(recording, config)).trajectory
-        return compare_to_truth(track, run.truth)
+        numbers = compare_to_truth(track, run.truth)
+        return np.array([numbers.position_rmse_m, numbers.nees])
 
-    untold = numbers()
-    both, place, yaw = (
-        numbers(mount_sigma_m=1.5, mount_sigma_deg=2.0),
-        numbers(mount_sigma_m=1.5),
-        numbers(mount_sigma_deg=2.0),
-    )
-    assert both.position_rmse_m < 0.7 * untold.position_rmse_m
-    assert both.nees < 0.5 * untold.nees
-    assert place.nees < untold.nees
-    assert yaw.nees < untold.nees
+    untold = rmse_and_nees()
+    assert (rmse_and_nees(mount_sigma_m=1.5, mount_sigma_deg=2.0) < [0.7, 0.5] * untold).all()
+    assert rmse_and_nees(mount_sigma_m=1.5)[1] < untold[1]
+    assert rmse_and_nees(mount_sigma_deg=2.0)[1] < untold[1]
 
 
-def test_a_wrong_unit_is_named_and_no_mount() -> None:
-    """Kilometres an hour, read as metres a second."""
+@pytest.mark.parametrize(("factor", "cure"), [(3.6, "check its unit"), (-1.0, "turn its mount by 180 deg")])
+def test_a_wrong_unit_or_sign_is_named(factor: float, cure: str) -> None:
+    """Kilometres an hour, read as metres a second; and wheels that count backwards."""
     scenario = Scenario(path="loops", duration_s=60.0, gnss_hz=2.0, pose_hz=0.0, log_hz=2.0, log_through="ground")
     run = simulate_slowly(scenario, 3)
 
-    def faster(m: Any) -> Any:
-        return replace(m, value=3.6 * m.value) if isinstance(m, BodyVelocity) else m
+    def otherwise(m: Any) -> Any:
+        return replace(m, value=factor * m.value) if isinstance(m, BodyVelocity) else m
 
-    found = app.simulated(replace(run, recording=run.recording.changed(faster)), compare=False).solution
+    recording = run.recording.changed(otherwise)
+    found = app.simulated(replace(run, recording=recording), compare=False).solution
     (line,) = (said for said in found.stats.warnings if said.startswith("log: its speed error"))
-    times = re.search(r"it reads ([\d.]+) times the speed: check its unit", line)
+    times = re.search(rf"it reads (-?[\d.]+) times the speed: {cure}", line)
     assert times
-    assert float(times[1]) == pytest.approx(3.6, rel=0.1)
-    assert "mount" not in line
+    assert float(times[1]) == pytest.approx(factor, rel=0.1)
+    assert ("mount" in line) == (factor < 0.0)
 
 
 def test_axes_that_its_messages_do_not_tell_are_named() -> None:

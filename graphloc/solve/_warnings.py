@@ -108,7 +108,10 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
     where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.3g} {slow.units[k]}"
     cure = "check its mount and the IMU's, or raise the configured sigma"
     if slow.axes[k] == "scale":
-        cure = f"it reads {1.0 + value[k]:.2f} times the speed: check its unit and calibration, or raise scale_sigma"
+        times = 1.0 + float(value[k])
+        wrong = "check its unit and calibration, or raise scale_sigma"
+        wrong = wrong if times > 0.0 else "turn its mount by 180 deg (rpy_deg), or check its sign"
+        cure = f"it reads {times:.2f} times the speed: {wrong}"
     return float(far[k]), f"its {slow.offset or slow.name} is estimated {far[k]:.1f} sigmas ({where}) from zero: {cure}"
 
 
