@@ -20,6 +20,10 @@ from graphloc.time import NS_PER_S
 
 _FEWEST, _LAG_S = 20, 0.1
 _NEVER_NEAR = 0.5  # of the RMS distance; of errors alone the 5 % point is 0.23 of it (Rayleigh)
+_LONGEST_M = 400.0  # of a craft
+# Chords of the way that tell the course: how long, and at least how far. How steady (0 to 1) the course of a craft that turns is at most,
+# and the line from one receiver to another is at least that does not turn with it.
+_CHORD_S, _CHORD_M, _TURNS, _FIXED = 10.0, 10.0, 0.7, 0.95
 _GAP = 3.0  # times the usual interval, from which nothing is known of the way in between
 _WITHOUT = 0.1  # share of fixes without a height, from which the others tell no range
 _NORMAL_90 = 3.29  # sigmas from the 5 % point to the 95 % point
@@ -64,7 +68,21 @@ def apart(first: GnssReport, second: GnssReport, fixes: TopicData, others: Topic
 
     variances, distances = zip(*map(varies, np.arange(-MOST_LATE_S, MOST_LATE_S + 0.5 * _LAG_S, _LAG_S)), strict=True)
     white = sum(max(r.scatter_m[:2]) ** 2 for r in (first, second) if r.scatter_m)
-    return TwoAntennas(math.sqrt(max(min(variances) - white, 0.0)), min(distances))
+    keeps_m = min(distances)
+    if keeps_m > _LONGEST_M or _by_datum(t, p, p - interpolated(t, other_t, q)):
+        keeps_m = 0.0
+    return TwoAntennas(math.sqrt(max(min(variances) - white, 0.0)), keeps_m)
+
+
+def _by_datum(t_s: Array, p_m: Array, apart_m: Array) -> bool:
+    """Return whether the line (N, 2) from another receiver to p (N, 2) stays as it is while the craft turns: a datum, or a base ashore."""
+    then = np.searchsorted(t_s, t_s + _CHORD_S)
+    now = np.flatnonzero(then < len(t_s))
+    chord = (p_m[then[now]] - p_m[now]) @ np.array([1.0, 1j])
+    chord = chord[np.abs(chord) > _CHORD_M]
+    # There and back is one direction, as of a ferry with two bows.
+    turns = abs((chord**2 / np.abs(chord)).sum()) < _TURNS * np.abs(chord).sum()
+    return bool(turns and np.hypot(*apart_m.mean(axis=0)) > _FIXED * np.hypot(*apart_m.T).mean())
 
 
 def _moving(fixes: TopicData) -> tuple[NDArray[np.int64], Array]:

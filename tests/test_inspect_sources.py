@@ -488,6 +488,21 @@ def test_two_antennas_on_a_ship_do_not_wander_against_each_other(tmp_path: Path)
     assert all(10.0 < s.mount_sigma_m < 16.0 for s in config.of_kind("gnss").values())
 
 
+@pytest.mark.parametrize("ashore", [False, True], ids=["another datum", "a base"])
+def test_what_does_not_turn_with_the_craft_is_no_other_antenna(ashore: bool, tmp_path: Path) -> None:
+    """80 m to the north throughout, or a base 1 km away: antennas were taken to be off by 37 and by 438 m."""
+    make = Messages(2)
+    items = two_receivers(
+        make, lambda t, _yaw: np.column_stack([0.0 * t, 80.0 + 0.0 * t, 0.0 * t]), claims_m=1.0, height=True
+    )
+    other = [message for topic, _, message in items if topic == "/cheap/fix"]
+    latitude, longitude = other[0].latitude + 1000.0 / 111e3, other[0].longitude
+    for message in other if ashore else []:
+        message.latitude, message.longitude = latitude, longitude
+    _, config, _ = look(tmp_path, items, make)
+    assert {s.mount_sigma_m for s in config.of_kind("gnss").values()} == {1.0}
+
+
 def test_a_late_receiver_of_one_antenna_tells_no_distance(tmp_path: Path) -> None:
     """Straight on, at 10 m/s, it looks like an antenna 4 m further back."""
     make = Messages(2)
