@@ -214,6 +214,9 @@ def test_parts_that_are_set_otherwise_have_constants_of_their_own() -> None:
     assert shared_constants("gnss", config) is None
     measured = config.sensors["gnss"].model_copy(update={"mount_sigma_m": 0.0})
     assert shared_constants("gnss_other", config.with_sensors({"gnss": measured})) is None
+    stern = {f"{name}_stern": config.sensors[name] for name in ("gnss", "gnss_other")}
+    unclear = config.with_sensors(stern)  # of the same topic, or of none: two antennas are not one
+    assert {shared_constants(name, unclear) for name in unclear.of_kind("gnss")} == {None}
 
 
 def test_online_resumes_with_its_one_antenna(tmp_path: Path) -> None:

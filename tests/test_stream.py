@@ -241,6 +241,7 @@ def test_a_fix_goes_to_the_sensor_that_reads_it() -> None:
     unclear = parse_config({"sensors": sets}, KINDS, "test")  # without topics nothing tells whose they are
     assert said({**FIX, "sensor": "gnss_other_stern"}, unclear).sensor == "gnss_other_stern"
     assert said({**rtk, "sensor": "gnss_stern"}, unclear).sensor == "gnss_stern"
+    assert "'sensor' is missing" in said(rtk, unclear).row.reason
 
 
 def test_stream_and_bag_give_the_same(tmp_path: Path) -> None:

@@ -167,8 +167,13 @@ class VesselConfig(Block):
         return [name, *(n for n, s in others.items() if (s.topic, s.nmea) == (own.topic, own.nmea))]
 
     def receiver_of(self, name: str) -> str:
-        """Return the name that stands for all sensors that read one receiver's fixes by turns: that of the first."""
-        return min(self.by_turns(name), key=list(self.sensors).index)
+        """Return the name that stands for all sensors that read one receiver's fixes by turns: that of the first.
+
+        Where several read the same of them (of two receivers without a topic) nothing tells whose they are: each stands for itself.
+        """
+        turns = self.by_turns(name)
+        read = [self.sensors[of].fixes for of in turns] if len(turns) > 1 else []
+        return name if len(set(read)) < len(read) else min(turns, key=list(self.sensors).index)
 
     def of_kind(self, kind: str) -> dict[str, Any]:
         """Return the enabled sensors of a kind, by name."""
