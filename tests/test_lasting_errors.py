@@ -12,7 +12,7 @@ import pytest
 
 from graphloc import app
 from graphloc.build import Stream
-from graphloc.config import PoseConfig
+from graphloc.config import BodyVelocityConfig, PoseConfig, SensorConfig, VesselConfig
 from graphloc.eval.ekf import run_honest
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun
@@ -20,7 +20,7 @@ from graphloc.factors import pose
 from graphloc.frames import Array, Datum
 from graphloc.graph import Decision
 from graphloc.measurements import Measurement, PoseFix
-from graphloc.online._snapshot import Snapshot
+from graphloc.online._snapshot import Snapshot, settings_of
 from graphloc.replay import replay
 from graphloc.solution import Graded
 from graphloc.solve._decide import Verdict
@@ -96,6 +96,24 @@ def test_it_goes_on_after_a_restart_but_not_on_other_axes(tmp_path: Path) -> Non
     assert any(e.startswith("resumed from a snapshot") for e in resumed.events)
     other = run.config.sensors[name].model_copy(update={"axes": ("x", "z")})
     assert name not in snapshot.anchor_for(run.config.with_sensors({name: other})).slow
+
+
+@pytest.mark.parametrize(
+    ("block", "was", "now"),
+    [
+        (BodyVelocityConfig(), {"scale_sigma": 0.05}, {"scale_sigma": 0.0, "mount_sigma_deg": 1.0}),
+        (BodyVelocityConfig(scale_sigma=0.0), {"mount_sigma_m": 1.0}, {"scale_sigma": 0.05, "through": "water"}),
+        (PoseConfig(axes=("z", "yaw")), {"slow_error": {"sigma_m": 1.0}}, {"slow_error": {"sigma_deg": 1.0}}),
+    ],
+)
+def test_a_restart_does_not_take_one_unknown_for_another(block: SensorConfig, was: Any, now: Any) -> None:
+    """Of as many numbers: a scale of 2 % would be taken for a yaw of 1 deg."""
+    told = block.model_dump()
+    first, same, other = (
+        VesselConfig(sensors={"one": type(block).model_validate({**told, **keys})}) for keys in (was, was, now)
+    )
+    assert settings_of(first) == settings_of(same)
+    assert settings_of(first) != settings_of(other)
 
 
 def test_the_honest_filter_is_told_of_it() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from graphloc.config import VesselConfig
+from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import in_one_line
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import ImuSample
@@ -144,9 +144,21 @@ class Snapshot:
 
 
 def settings_of(config: VesselConfig) -> dict[str, Any]:
-    """Return by sensor, as plain data, what its slow state and constants are added to: axes, mounts, time offset, survey, height."""
-    said = {"axes", "mount", "cameras", "lidars", "time_offset_s", "survey", "height_m"}
-    return {name: sensor.model_dump(mode="json", include=said) for name, sensor in config.sensors.items()}
+    """Return by sensor, as plain data, what its slow state and constants are added to: axes, mounts, time offset, survey, height; and which it has."""
+    said = {"axes", "through", "mount", "cameras", "lidars", "time_offset_s", "survey", "height_m"}
+    return {
+        name: {**sensor.model_dump(mode="json", include=said), "unknown": _unknown(sensor)}
+        for name, sensor in config.sensors.items()
+    }
+
+
+def _unknown(sensor: SensorConfig) -> list[str]:
+    """Return which parts the slow state of a speed or of poses has, of those that are left out where their sigma is 0."""
+    if not hasattr(sensor, "axes"):
+        return []
+    sigmas = sensor.model_dump(include={"scale_sigma", "mount_sigma_m", "mount_sigma_deg", "slow_error"})
+    sigmas |= sigmas.pop("slow_error", {})
+    return [key for key, sigma in sigmas.items() if sigma]
 
 
 class SnapshotFile:
