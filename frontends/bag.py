@@ -27,6 +27,7 @@ from graphloc.errors import InputError
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import courses_of_fixes, motion_of_fixes
 from graphloc.frontends._clock import ScanClock, corrected_ns, usual_latency_s
+from graphloc.frontends._exchanged import exchanged_warnings
 from graphloc.frontends._mount_yaw import yaw_in_craft
 from graphloc.frontends._part import Bags
 from graphloc.frontends._reader import Reader, either
@@ -116,7 +117,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
         _refuse_unit(imu, sensors)
         warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, sensors, mounts, config)
     warnings += _silent(sensors, rows, topics, config) + _unstamped(sensors, topics) + _heightless(sensors, config)
-    warnings += _along_fewer(sensors)
+    warnings += _along_fewer(sensors) + exchanged_warnings(sensors)
     warnings += [
         f"{b.topic}: {b.unstamped} of its headers hold no stamp: recording times are used"
         for b in (truth, check)

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -22,6 +23,8 @@ from graphloc.frames import Array, wrap_angle
 from graphloc.graph import PLACE, Attachment, Decision, Sensor, antenna_off_m, corrections
 from graphloc.linear import factors_of
 from graphloc.measurements import GnssPosition, Measurement
+from graphloc.online._lag import Lag
+from graphloc.online._live import ReceiverDetectors
 from graphloc.replay import replay
 from tests.faults import Fed, arrivals_of, feed
 from tests.slowly import with_few_states
@@ -289,3 +292,20 @@ def test_a_snapshot_of_other_constants_is_not_used(tmp_path: Path) -> None:
         said = feed(smoother(other, snapshot=copy), other, came[half:][: len(came) // 40]).events
         assert any(e.startswith("resumed from a snapshot") for e in said) is used
         assert any("of another size" in e and e.endswith("starts without it") for e in said) is not used
+
+
+def test_online_an_antenna_is_named_again_once_it_proves_twice_as_far_off() -> None:
+    """What turns tell of it grows with them."""
+    stream = SimpleNamespace(receiver=ReceiverDetectors())
+    by = {PLACE[0]: 0.0}
+    lag = SimpleNamespace(
+        problem=SimpleNamespace(streams={"gnss": stream}),
+        fresh=True,
+        _constants=SimpleNamespace(far_off=lambda _: [(key, value, f"add {value}") for key, value in by.items()]),
+        _states=SimpleNamespace(late_far_off=lambda _: []),
+    )
+    said: list[str] = []
+    for value in (-3.0, -3.5, -5.9, -6.1, -12.0, -14.2, -3.0):
+        by[PLACE[0]] = value
+        said += Lag.setting_warnings(cast("Lag", lag))
+    assert said == ["add -3.0", "add -6.1", "add -14.2"]

@@ -108,8 +108,11 @@ class Constants:
             elif key in self._known:
                 yield constant, self._known[key].value
 
-    def far_off(self, stream: LiveStream) -> Iterator[tuple[str, str]]:
-        """Yield each setting of a stream that is clearly far from where the window has it, and a line on that; of what it shares another says it."""
+    def far_off(self, stream: LiveStream) -> Iterator[tuple[str, float, str]]:
+        """Yield each setting of a stream that is clearly far from where the window has it, by how much, and a line on that.
+
+        Of what it shares another sensor says it.
+        """
         if stream.shares is not None:
             return
         for constant, key in zip(stream.constants, constant_keys(stream), strict=True):
@@ -120,7 +123,7 @@ class Constants:
                     # Of a place the largest: a mount may turn its axes.
                     unsure = sigma[-3:].max() if setting in PLACE else sigma[constant.corrects.index(setting)]
                     if abs(by) > FAR_OFF * unsure:
-                        yield setting, said
+                        yield setting, by, said
 
     def seen(self) -> dict[Number, int]:
         """Return the keys of the constants in the graph."""

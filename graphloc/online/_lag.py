@@ -230,12 +230,15 @@ class Lag:
         return lines
 
     def setting_warnings(self) -> list[str]:
-        """Return a warning on each delay or antenna's place that newly is clearly far from where it is set."""
+        """Return a warning on each delay or antenna's place that is clearly far from where it is set, newly or by twice as much as was said.
+
+        What turns tell of an antenna grows with them: the first line may name a fifth of it.
+        """
         lines = list[str]()
         for stream in self.problem.streams.values() if self.fresh else ():
-            for key, line in (*self._constants.far_off(stream), *self._states.late_far_off(stream)):
-                if key not in stream.receiver.far_off:
-                    stream.receiver.far_off.add(key)
+            for key, by, line in (*self._constants.far_off(stream), *self._states.late_far_off(stream)):
+                if abs(by) >= 2.0 * stream.receiver.far_off.get(key, 0.0):
+                    stream.receiver.far_off[key] = abs(by)
                     lines.append(line)
         return lines
 

@@ -157,8 +157,8 @@ class ReceiverDetectors:
     repeated_fix: RepeatedFixDetector = field(default_factory=RepeatedFixDetector)
     repeated_velocity: RepeatedVelocityDetector = field(default_factory=RepeatedVelocityDetector)
     jump: JumpDetector = field(default_factory=JumpDetector)
-    far_off: set[str] = field(default_factory=set)
-    """Settings of which it was said that they are far from the estimate."""
+    far_off: dict[str, float] = field(default_factory=dict)
+    """Settings of which it was said that they are far from the estimate, and by how much it was."""
 
     def forget(self) -> None:
         """Forget what is by the estimate, which is given up; not the levels of the fixes: a restart makes none of them right."""

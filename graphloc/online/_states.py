@@ -275,8 +275,8 @@ class States:
                 J[rows, first[at.slow_key] : first[at.slow_key] + width] = residual.slow_jacobian()
         return np.asarray(J @ window.covariance([*poses, *slow]) @ J.T)
 
-    def late_far_off(self, stream: LiveStream) -> list[tuple[str, str]]:
-        """Return `TIME_OFFSET` and a line where the stamps of a sensor, by its slow state, are clearly far from where they are set."""
+    def late_far_off(self, stream: LiveStream) -> list[tuple[str, float, str]]:
+        """Return `TIME_OFFSET`, by how much, and a line where the stamps of a sensor, by its slow state, are clearly far from where they are set."""
         if stream.slow is None or (axis := stream.slow.late) is None:
             return []
         key = keys.slow(stream.number, self._problem.timeline.slow_of[self._newest.number])
@@ -286,7 +286,7 @@ class States:
         said = late_far_off(stream.name, stream.slow, late_s)
         # The sigma is asked for last: it takes time.
         clear = said and abs(late_s) > FAR_OFF * np.sqrt(self._window.covariance([key])[axis, axis])
-        return [(TIME_OFFSET, line) for line in said] if clear else []
+        return [(TIME_OFFSET, late_s, line) for line in said] if clear else []
 
     def links(self) -> list[Held]:
         """Return the IMU factors, but for the oldest tenth: the solver cannot relinearise the poses there."""

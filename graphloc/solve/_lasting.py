@@ -69,6 +69,6 @@ def lasting_error(t_s: Array, residuals: Array) -> Lasting | None:
     if first < max(_LEAST, _SURE / np.sqrt(residuals.size)):
         return None
     for lag in np.unique(np.geomspace(2, n // 3, 60).astype(int)):
-        if correlation(int(lag)) < first / np.e:
+        if correlation(int(lag)) < first * np.exp(-1.0):
             break
     return Lasting(float(np.sqrt(first * variance.mean())), float(np.median(t_s[lag:] - t_s[: n - lag])))

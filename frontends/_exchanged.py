@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Velocities whose east and north are exchanged, beside the motion of the fixes: read in the wrong `convention`, they draw the track kilometres away."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from graphloc.config import VelocityConfig
+from graphloc.frontends._assess import MeasuredMotion, motion_of_fixes
+from graphloc.frontends._readings import Readings
+from graphloc.measurements import GnssPosition, GnssVelocity
+from graphloc.series import interpolated
+from graphloc.time import NS_PER_S, stamps_of
+
+_HALF_S = 1.0  # of a chord
+_FEWEST = 20  # chords of a craft under way
+_MOVES_MPS = 0.5
+_CLEARLY = 0.3  # times what they differ by as they are read
+
+
+def exchanged_warnings(sensors: Sequence[Readings]) -> list[str]:
+    """Return a line for each receiver's velocity that fits the fixes' motion with east and north exchanged, and not as it is read."""
+    fixes = {r.sensor: [v for v in r.values if isinstance(v, GnssPosition)] for r in sensors}
+    name = max(fixes, key=lambda sensor: len(fixes[sensor]), default="")
+    motion = motion_of_fixes(name, fixes[name]) if name else None
+    if motion is None:
+        return []
+    lines = []
+    for r in sensors:
+        own = [v for v in r.values if isinstance(v, GnssVelocity)]
+        if isinstance(r.config, VelocityConfig) and own and (off := _apart_mps(motion, own)) is not None:
+            as_read, exchanged = off
+            if exchanged < _CLEARLY * as_read:
+                other = "enu" if r.config.convention == "ned" else "ned"
+                lines.append(
+                    f"{r.sensor}: its velocities differ from the motion of {name} by {as_read:.1f} m/s, with east and north exchanged by "
+                    f"{exchanged:.1f}: set convention: {other}"
+                )
+    return lines
+
+
+def _apart_mps(motion: MeasuredMotion, velocities: Sequence[GnssVelocity]) -> tuple[float, float] | None:
+    """Return by how much velocities differ from chords of a way, m/s, median, as they are and exchanged; None of a craft that hardly moves."""
+    assert motion.way_m is not None
+    t = (stamps_of(velocities) - motion.origin_ns) / NS_PER_S
+    v = np.array([m.v_world_mps[:2] for m in velocities])
+    inside = (t > motion.t_s[0] + _HALF_S) & (t < motion.t_s[-1] - _HALF_S)
+    t, v = t[inside], v[inside]
+    way = np.column_stack([motion.way_m.real, motion.way_m.imag])
+    chord = (interpolated(t + _HALF_S, motion.t_s, way) - interpolated(t - _HALF_S, motion.t_s, way)) / (2.0 * _HALF_S)
+    moves = np.hypot(*chord.T) > _MOVES_MPS
+    if np.count_nonzero(moves) < _FEWEST:
+        return None
+    as_read, exchanged = (float(np.median(np.hypot(*(a - chord)[moves].T))) for a in (v, v[:, ::-1]))
+    return as_read, exchanged
