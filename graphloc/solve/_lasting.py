@@ -43,16 +43,20 @@ def lasting(stream: Stream, verdicts: Sequence[Verdict]) -> Lasting | None:
     kept = [k for k, own in enumerate(in_m) if axes and own == axes]
     if len(kept) < _FEWEST:
         return None
+    residuals = [used[k][1] for k in kept]
+    stated = np.mean([np.diagonal(r.cov)[axes] for r in residuals])
     return lasting_error(
-        stamps_of([used[k][0] for k in kept]) / NS_PER_S, np.array([used[k][1].raw[axes] for k in kept])
+        stamps_of([used[k][0] for k in kept]) / NS_PER_S, np.array([r.raw[axes] for r in residuals]), np.sqrt(stated)
     )
 
 
-def lasting_error(t_s: Array, residuals: Array) -> Lasting | None:
+def lasting_error(t_s: Array, residuals: Array, stated_m: float) -> Lasting | None:
     """Return the error that residuals share with those before them, clearly; None if there is none.
 
+    Nor is there one where independent errors of as many as share it would be no smaller: then the bounds have it.
+
     Args:
-        t_s: (N,) when. residuals: (N, k), m.
+        t_s: (N,) when. residuals: (N, k), m. stated_m: sigma of each, of an axis.
     """
     n = len(residuals)
     # What they have in common throughout is no error that lasts for a while: a datum or a mount.
@@ -71,4 +75,7 @@ def lasting_error(t_s: Array, residuals: Array) -> Lasting | None:
     for lag in np.unique(np.geomspace(2, n // 3, 60).astype(int)):
         if correlation(int(lag)) < first * np.exp(-1.0):
             break
-    return Lasting(float(np.sqrt(first * variance.mean())), float(np.median(t_s[lag:] - t_s[: n - lag])))
+    sigma_m = float(np.sqrt(first * variance.mean()))
+    if sigma_m < stated_m / np.sqrt(2.0 * lag):
+        return None
+    return Lasting(sigma_m, float(np.median(t_s[lag:] - t_s[: n - lag])))

@@ -273,8 +273,9 @@ def _lasting_error(stream: Stream, verdicts: Sequence[Verdict]) -> list[str]:
     """Return a line if poses share errors that count as independent."""
     if not isinstance(stream.config, PoseConfig) or (found := lasting(stream, verdicts)) is None:
         return []
-    said = f"{stream.name}: its errors last for some {found.time_s:.0f} s and count as independent, so the bounds are too small"
-    said += f": set slow_error: {{sigma_m: {found.sigma_m:.2g}, time_constant_s: {found.time_s:.0f}}}, or more"
+    said = f"{stream.name}: its errors last for some {found.time_s:.0f} s, by its residuals, and count as independent"
+    said += f": set slow_error: {{sigma_m: {found.sigma_m:.2g}, time_constant_s: {found.time_s:.0f}}}, or more; "
+    said += "if it has none such, what carries the track beside it (IMU, wheels) is believed too much"
     return [Graded(said, f"errors of {stream.name} that last", found.sigma_m)]
 
 
