@@ -236,6 +236,24 @@ def test_a_wrong_unit_or_sign_is_named(factor: float, cure: str) -> None:
     assert ("mount" in line) == (factor < 0.0)
 
 
+def test_wheels_that_are_turned_are_said_to_be_so() -> None:
+    """By 3.6 deg, of a mount that is good to 1 deg, beside a compass that is good to 1 deg."""
+    scenario = Scenario(path="loops", duration_s=60.0, gnss_hz=2.0, pose_hz=0.0, log_hz=2.0, log_through="ground")
+    run = simulate_slowly(scenario, 3)
+    turned = np.radians(3.6)
+
+    def rolled(m: Any) -> Any:
+        if not isinstance(m, BodyVelocity):
+            return m
+        value = m.value[0] * np.array([np.cos(turned), -np.sin(turned)])
+        return replace(m, axes=("x", "y"), value=value, cov=0.05**2 * np.eye(2))
+
+    block = configured(topic="/log", axes=["x", "y"], mount_sigma_deg=1.0)
+    config = run.config.model_copy(update={"sensors": {**run.config.sensors, "log": block}})
+    found = app.simulated(replace(run, recording=run.recording.changed(rolled), config=config), compare=False).solution
+    assert any(line.startswith("log: its velocities are turned by +") for line in found.stats.warnings)
+
+
 def test_axes_that_its_messages_do_not_tell_are_named() -> None:
     values = [decode(SimpleNamespace(data=4.0), configured(axes=["x", "y"]), NUMBERS[0])]
     for axes, said in ((["x", "y"], ["not y of its axes"]), (["x"], [])):

@@ -65,22 +65,27 @@ def with_usbl(seed: int, **slow_error: float) -> SimulatedRun:
     return replace(run, recording=run.recording.changed(moved), config=config)
 
 
-def covered(run: SimulatedRun, solution: Any) -> float:
-    return float(compare_to_truth(solution.trajectory, run.truth).coverage_95 or 0.0)
+def assert_honest(run: SimulatedRun, solution: Any) -> None:
+    """Bounds that are neither too small nor far too wide: the NEES of an honest one is 2, and one run holds seven such errors."""
+    found = compare_to_truth(solution.trajectory, run.truth)
+    assert found.coverage_95 is not None
+    assert found.nees is not None
+    assert found.coverage_95 > 0.85
+    assert 0.5 < found.nees < 4.0
 
 
 def test_bounds_include_an_error_that_lasts() -> None:
     """Without its model 3 % of the truth lie inside: bounds are those of the mean of a dozen independent poses."""
     run = with_usbl(0, sigma_m=SIGMA_M, time_constant_s=TIME_S)
     solution = app.simulated(run, compare=False).solution
-    assert covered(run, solution) > 0.85
+    assert_honest(run, solution)
     slow = solution.slow["matcher"]
     assert (slow.axes, slow.units) == (("east", "north"), ("m", "m"))
 
 
 def test_bounds_include_an_error_that_lasts_online() -> None:
     run = with_usbl(1, sigma_m=SIGMA_M, time_constant_s=TIME_S)
-    assert covered(run, replay(run.recording, run.config).solution) > 0.85
+    assert_honest(run, replay(run.recording, run.config).solution)
 
 
 def test_it_goes_on_after_a_restart_but_not_on_other_axes(tmp_path: Path) -> None:

@@ -138,9 +138,10 @@ def _turned_mount(stream: Stream, result: BatchResult) -> list[str]:
     sigmas = abs(others) / float(np.sqrt(sigma**2 + others_var))
     if sigmas < _TURNED:
         return []
+    along = stream.row.along_body
     said = (
-        f"its headings are turned by {np.degrees(others):+.1f} deg against the other sensors' ({sigmas:.1f} sigmas of what mounts are "
-        "allowed to be off by): check its mount (of a LiDAR matcher, those of the LiDARs) and theirs"
+        f"its {'velocities' if along else 'headings'} are turned by {np.degrees(others):+.1f} deg against the other sensors' ({sigmas:.1f} "
+        f"sigmas of what mounts are allowed to be off by): check its mount{'' if along else ' (of a LiDAR matcher, those of the LiDARs)'} and theirs"
     )
     return [f"{stream.name}: {said}"]
 
