@@ -138,10 +138,12 @@ def _turned_mount(stream: Stream, result: BatchResult) -> list[str]:
     sigmas = abs(others) / float(np.sqrt(sigma**2 + others_var))
     if sigmas < _TURNED:
         return []
-    along = stream.row.along_body
+    turned, checked = "its headings are turned by", "its mount (of a LiDAR matcher, those of the LiDARs)"
+    if stream.row.along_body:
+        turned, checked = "its velocities are turned by", "its mount"
     said = (
-        f"its {'velocities' if along else 'headings'} are turned by {np.degrees(others):+.1f} deg against the other sensors' ({sigmas:.1f} "
-        f"sigmas of what mounts are allowed to be off by): check its mount{'' if along else ' (of a LiDAR matcher, those of the LiDARs)'} and theirs"
+        f"{turned} {np.degrees(others):+.1f} deg against the other sensors' ({sigmas:.1f} sigmas of what mounts are allowed to be off by): "
+        f"check {checked} and theirs"
     )
     return [f"{stream.name}: {said}"]
 
