@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from graphloc.config import VelocityConfig
-from graphloc.frontends._assess import MeasuredMotion, motion_of_fixes
+from graphloc.frontends._assess import MeasuredMotion
 from graphloc.frontends._readings import Readings
-from graphloc.measurements import GnssPosition, GnssVelocity
+from graphloc.measurements import GnssVelocity
 from graphloc.series import interpolated
 from graphloc.time import NS_PER_S, stamps_of
 
@@ -20,13 +20,15 @@ _MOVES_MPS = 0.5
 _CLEARLY = 0.3  # times what they differ by as they are read
 
 
-def exchanged_warnings(sensors: Sequence[Readings]) -> list[str]:
-    """Return a line for each receiver's velocity that fits the fixes' motion with east and north exchanged, and not as it is read."""
-    fixes = {r.sensor: [v for v in r.values if isinstance(v, GnssPosition)] for r in sensors}
-    name = max(fixes, key=lambda sensor: len(fixes[sensor]), default="")
-    motion = motion_of_fixes(name, fixes[name]) if name else None
-    if motion is None:
+def exchanged_warnings(sensors: Sequence[Readings], motions: Mapping[str, MeasuredMotion]) -> list[str]:
+    """Return a line for each receiver's velocity that fits the fixes' motion with east and north exchanged, and not as it is read.
+
+    Args:
+        motions: of the fixes of each receiver; that of most is taken.
+    """
+    if not motions:
         return []
+    name, motion = max(motions.items(), key=lambda item: len(item[1].t_s))
     lines = []
     for r in sensors:
         own = [v for v in r.values if isinstance(v, GnssVelocity)]

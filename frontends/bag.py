@@ -25,7 +25,7 @@ from graphloc.config import (
 )
 from graphloc.errors import InputError
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
-from graphloc.frontends._assess import courses_of_fixes, motion_of_fixes
+from graphloc.frontends._assess import MeasuredMotion, courses_of_fixes, motion_of_fixes
 from graphloc.frontends._clock import ScanClock, corrected_ns, usual_latency_s
 from graphloc.frontends._exchanged import exchanged_warnings
 from graphloc.frontends._mount_yaw import yaw_in_craft
@@ -113,11 +113,12 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
     warnings += _far_levers(config, mounts)
     imu, measurements, dropped = _usable(sensors, config, warnings)
     rows += dropped
+    motions = _motions_of_fixes(sensors)
     if imu is not None:
         _refuse_unit(imu, sensors)
-        warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, sensors, mounts, config)
+        warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, [*motions.values()], mounts, config)
     warnings += _silent(sensors, rows, topics, config) + _unstamped(sensors, topics) + _heightless(sensors, config)
-    warnings += _along_fewer(sensors) + exchanged_warnings(sensors)
+    warnings += _along_fewer(sensors) + exchanged_warnings(sensors, motions)
     warnings += [
         f"{b.topic}: {b.unstamped} of its headers hold no stamp: recording times are used"
         for b in (truth, check)
@@ -328,12 +329,18 @@ def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
     return lines
 
 
-def _mount_warnings(imu: ImuSeries, sensors: Sequence[Readings], mounts: Mounts, config: VesselConfig) -> list[str]:
+def _motions_of_fixes(sensors: Sequence[Readings]) -> dict[str, MeasuredMotion]:
+    """Return the motion of each receiver's fixes, as far as these tell one."""
+    fixes = {r.sensor: [v for v in r.values if isinstance(v, GnssPosition)] for r in sensors}
+    return {sensor: m for sensor, own in fixes.items() if (m := motion_of_fixes(sensor, own))}
+
+
+def _mount_warnings(
+    imu: ImuSeries, motions: Sequence[MeasuredMotion], mounts: Mounts, config: VesselConfig
+) -> list[str]:
     """Return a line if the IMU's mount has a wrong yaw, by the motion of the fixes; no heading sensor would contradict it."""
     mount = config.sensors[imu.sensor].mount
     R = mounts[imu.sensor][1] if imu.sensor in mounts else mount.R_body_sensor
-    fixes = {r.sensor: [v for v in r.values if isinstance(v, GnssPosition)] for r in sensors}
-    motions = [m for sensor, own in fixes.items() if (m := motion_of_fixes(sensor, own))]
     found = (
         yaw_in_craft(imu.stamps_ns, imu.accel_mps2 @ R.T, imu.gyro_radps @ R.T, motions) if len(imu.stamps_ns) else None
     )

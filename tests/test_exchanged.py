@@ -11,6 +11,7 @@ from graphloc.config import GnssConfig, VelocityConfig
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._exchanged import exchanged_warnings
 from graphloc.frontends._readings import Readings
+from graphloc.frontends.bag import _motions_of_fixes
 from graphloc.measurements import GnssPosition, GnssVelocity
 
 DATUM = Datum(Geodetic(59.3, 18.1, 20.0))
@@ -42,7 +43,8 @@ def said(places: Array, velocities: Array, convention: str = "enu") -> list[str]
         SimpleNamespace(sensor="gnss", config=GnssConfig(topic="/fix"), values=fixes),
         SimpleNamespace(sensor="velocity", config=config, values=moving),
     ]
-    return exchanged_warnings(cast("list[Readings]", readings))
+    motions = _motions_of_fixes(cast("list[Readings]", readings))
+    return exchanged_warnings(cast("list[Readings]", readings), motions)
 
 
 @pytest.mark.parametrize(("convention", "other"), [("enu", "ned"), ("ned", "enu")])
