@@ -15,6 +15,7 @@ from graphloc.frontends._clock import MOST_LATE_S, MOST_ON_ITS_WAY_S
 from graphloc.frontends._mount_yaw import FEWEST, HALF_S, MOVES_M, STEP_S, Felt, bent
 from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import without_line
+from graphloc.series import integral
 from graphloc.time import NS_PER_S
 
 _BLOCK_S = 20.0
@@ -103,8 +104,9 @@ class MotionOffset(NamedTuple):
 def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | None:
     """Return by how much the stamps of a motion are off, by the accelerometer; None if that does not show it.
 
-    Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. Pitch swings a high
-    antenna along it, so its height (0 m, give or take ten) is estimated with the offset: c is the correlation with what is felt and that swing together. With
+    Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. The course is the
+    chord's, and what is felt is taken along the chord of the same speeds by the gyroscope: in a turn where the craft brakes, heading
+    and chord differ, and what it feels across would look like a delay. Pitch swings a high antenna along it, so its height (0 m, give or take ten) is estimated with the offset: c is the correlation with what is felt and that swing together. With
     c at the best offset and c0 at none, N (c^2 - c0^2) / (1 - c^2) is the gain in chi-square over N windows.
 
     Args:
@@ -125,7 +127,7 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
             continue
         middle = middle[good]
         along = (moved * np.conj(chord / np.maximum(np.abs(chord), MOVES_M)))[good].real
-        parts = [_felt_along(felt, middle + lag, half_s) for lag in lags]
+        parts = [_felt_along(felt, at, motion.speed_mps, middle, half_s, lag) for lag in lags]
         alone = max(_explained(along, own, swung, np.inf) for own, swung in parts)
         held = (1.0 - alone**2) * float(along.var()) * len(along) / windows / _HIGH_M**2
         c = np.array([_explained(along, *part, held) for part in parts])
@@ -167,10 +169,18 @@ def later_than(fixes: MeasuredMotion, velocity: MeasuredMotion) -> tuple[float, 
     return value, float(np.sqrt(0.5 * left / (power * windows)))
 
 
-def _felt_along(felt: Felt, middle_s: Array, half_s: float) -> tuple[Array, Array]:
-    """Return the sensor's own forward acceleration, and that of a place a metre above it by pitch alone, times the square of `half_s`."""
-    ahead = np.exp(-1j * np.interp(middle_s, felt.t_s, felt.turned))
-    moved, swung = (bent(felt.t_s, way, middle_s, half_s)[0] for way in (felt.way_m, felt.swing_m))
+def _felt_along(
+    felt: Felt, at_s: Array, speed_mps: Array, middle_s: Array, half_s: float, late_s: float
+) -> tuple[Array, Array]:
+    """Return the sensor's own acceleration along the course, and that of a place a metre above it by pitch alone, times the square of `half_s`.
+
+    Args:
+        at_s, speed_mps: (M,) of the motion. middle_s: (N,) of the windows. late_s: what is added to both times.
+    """
+    course = np.exp(1j * np.interp(at_s + late_s, felt.t_s, felt.turned))
+    _, chord = bent(at_s, integral(at_s, speed_mps * course), middle_s, half_s)
+    ahead = np.exp(-1j * np.angle(chord))
+    moved, swung = (bent(felt.t_s, way, middle_s + late_s, half_s)[0] for way in (felt.way_m, felt.swing_m))
     return (moved * ahead).real, (swung * ahead).real
 
 

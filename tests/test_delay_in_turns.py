@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A delay of fixes by what the IMU feels, of a craft that slows down in its turns."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter1d
+
+from graphloc.frontends._assess import MeasuredMotion
+from graphloc.frontends._mount_yaw import Felt
+from graphloc.frontends._time_offsets import MotionOffset, motion_time_offset
+from graphloc.series import integral
+
+RATE_HZ = 100.0
+
+
+def found(late_s: float, turn_deg: float, seed: int) -> MotionOffset | None:
+    """Legs of 16 s at 5 to 9 m/s; in turns of 5 s, left and right, it brakes to 3 m/s by 1 m/s^2; fixes of 0.15 m, 0.5 m behind the IMU."""
+    rng, t = np.random.default_rng(seed), np.arange(0.0, 250.0, 1.0 / RATE_HZ)
+    leg = (t // 21.0).astype(int)
+    turns = t % 21.0 >= 16.0
+    cruise = rng.uniform(5.0, 9.0, leg[-1] + 1)[leg]
+    braked, sped = cruise - (t % 21.0 - 16.0), 3.0 + t % 21.0
+    speed = np.where(turns, np.maximum(braked, 3.0), np.where(leg > 0, np.minimum(sped, cruise), cruise))
+    rate = np.where(turns, np.deg2rad(turn_deg / 5.0) * rng.choice([-1.0, 1.0], leg[-1] + 1)[leg], 0.0)
+    speed, rate = (gaussian_filter1d(v, s * RATE_HZ) for v, s in ((speed, 1.0), (rate, 0.4)))
+    heads = np.exp(1j * integral(t, rate))
+    place = integral(t, speed * heads)
+    ahead, left = np.gradient(speed, t), speed * rate
+    zero, stamps = np.zeros(len(t)), (t * 1e9).astype(np.int64)
+    accel = np.column_stack([ahead, left, zero + 9.81]) + 0.1 * rng.normal(size=(len(t), 3))
+    gyro = np.column_stack([zero, zero, rate]) + 0.003 * rng.normal(size=(len(t), 3))
+    at = np.arange(0.0, 250.0, 0.2)
+    fixes = np.interp(at, t, place - 0.5 * heads) + 0.15 * (rng.normal(size=(2, len(at))).T @ [1.0, 1j])
+    motion = MeasuredMotion("fixes", 0, at + late_s, np.interp(at, t, speed), fixes)
+    return motion_time_offset(Felt.of(stamps, accel, gyro, 9.81), motion)
+
+
+@pytest.mark.parametrize("turn_deg", [45.0, 90.0, 150.0])
+@pytest.mark.parametrize("late_s", [0.0, 0.5])
+def test_a_delay_is_told_apart_from_turns(late_s: float, turn_deg: float) -> None:
+    """By the heading instead of the chord, fixes in time looked 0.15, 0.5 and 0.9 s late, clearly."""
+    for seed in range(2):
+        offset = found(late_s, turn_deg, seed)
+        assert offset is not None
+        assert offset.clear == (late_s > 0.0)
+        assert offset.value_s == pytest.approx(-late_s, abs=0.08 if offset.clear else 2.0 * offset.sigma_s + 0.05)
