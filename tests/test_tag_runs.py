@@ -509,7 +509,7 @@ def test_a_tag_is_found_by_the_mount_that_the_run_has_found() -> None:
 @pytest.mark.parametrize("sigma_deg", [1.0, 0.0])
 def test_a_camera_whose_mount_is_turned_is_named(sigma_deg: float) -> None:
     """It looks ahead, and the configuration has it look to port: what it truly is, is said, whether estimated or refused."""
-    docked = dock(change=turned(90.0), lasts_s=40.0, rate_hz=1.0, mount_sigma_deg=sigma_deg)
+    docked = dock(change=turned(90.0), lasts_s=30.0, rate_hz=1.0, mount_sigma_deg=sigma_deg)
     used = docked.outcomes().get("used", 0)
     assert used > 0.9 * len(docked.right) if sigma_deg else used < 0.1 * len(docked.right)
     assert ("tags: its camera's mount or clock is estimated" in docked.said) == bool(sigma_deg)
