@@ -31,7 +31,7 @@ from graphloc.imu_spikes import WHY as SPIKE
 from graphloc.imu_spikes import spike_warning, spikes
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
-from graphloc.thinning import HEADINGS_APART_NS, THINNED, Thinning
+from graphloc.thinning import LEAST_APART_NS, THINNED, Thinning
 from graphloc.time import NS_PER_S, utc_text
 
 
@@ -283,14 +283,14 @@ def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     return rows
 
 
-def thin_headings(readings: Readings) -> list[LedgerRow]:
-    """Drop headings that come faster than a compass's error changes: at 500 Hz they would take four times the memory of all else.
+def thin(readings: Readings) -> list[LedgerRow]:
+    """Drop headings and velocities along the body that come faster than their errors change: each costs time, and at 500 Hz memory.
 
-    Only headings in order of their stamps are dropped, evenly.
+    Only what is in order of its stamps is dropped, evenly.
     """
-    if not isinstance(readings.config, CompassConfig):
+    if not isinstance(readings.config, (CompassConfig, BodyVelocityConfig)):
         return []
-    thinning = Thinning(HEADINGS_APART_NS)
+    thinning = Thinning(LEAST_APART_NS)
     bad = np.array([thinning.drops(stamp_ns) for stamp_ns in readings.stamps_ns], dtype=bool)
     return readings.drop(bad, rejected(THINNED))
 

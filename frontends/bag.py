@@ -43,7 +43,7 @@ from graphloc.frontends._readings import (
     reject_scattered,
     reject_set_back,
     reject_stored,
-    thin_headings,
+    thin,
 )
 from graphloc.frontends._references import Reference, check_speed, true_trajectory
 from graphloc.frontends._sanity import lever_warning
@@ -192,7 +192,7 @@ def _usable(
         else:
             rows += reject_repeats(readings) + reject_stored(readings, warnings)
             rows += reject_far(readings, config, warnings) + judge_fixes(readings, warnings)
-            rows += thin_headings(readings) + reject_scattered(imu, readings, warnings)
+            rows += thin(readings) + reject_scattered(imu, readings, warnings)
             measurements += [v for v in readings.values if isinstance(v, Measurement)]
     return imu, measurements, rows
 

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-HEADINGS_APART_NS = 45_000_000
-"""Between two headings that are used: 20 a second stay, though their stamps jitter."""
-THINNED = "less than 0.05 s after the heading before: what a compass errs lasts longer, so that it tells nothing new"
+LEAST_APART_NS = 45_000_000
+"""Between two headings, or two velocities along the body, that are used: 20 a second stay, though their stamps jitter."""
+THINNED = "less than 0.05 s after the one before: what it errs lasts longer, so that it tells nothing new"
 
 
 class Thinning:

@@ -31,8 +31,9 @@ from graphloc.frames import Datum
 from graphloc.frontends._source import Bag
 from graphloc.frontends.bag import read_recording
 from graphloc.ledger import Ledger, Outcome
-from graphloc.measurements import CompassHeading, GnssPosition
+from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition
 from graphloc.recording import Recording
+from graphloc.thinning import THINNED
 from tests.bagfactory import START_NS, Messages, S, still_run, write_bag
 
 KINDS: dict[str, type[SensorConfig]] = {
@@ -441,3 +442,16 @@ def test_headings_that_come_faster_than_a_compass_errs_are_thinned(rate_hz: int,
     assert sum(isinstance(m, CompassHeading) for m in recording.measurements) == read
     assert sum(row.reason.startswith("less than 0.05 s") for row in recording.rows) == 4 * rate_hz - read
     assert accounted(recording) == recording.message_count
+
+
+def test_wheels_faster_than_they_err_anew_are_thinned(tmp_path: Path) -> None:
+    """At 100 Hz each would be a factor of the graph: every fifth is used, and the others have rows."""
+    make, items = Messages(2), []
+    for k in range(300):
+        at_ns = START_NS + k * S // 100
+        items += [("/imu", at_ns, make.imu(at_ns)), ("/odom", at_ns, make.odometry(at_ns, v=(1.0, 0.0, 0.0)))]
+    bag = write_bag(tmp_path / "run", make, items, "mcap")
+    recording = read_recording(bag, vessel(gnss=None, wheels={"kind": "body_velocity", "topic": "/odom"}))
+    assert [m.stamp_ns for m in recording.of(BodyVelocity)] == [START_NS + k * S // 20 for k in range(60)]
+    reasons = [(row.outcome, row.reason) for row in recording.rows if row.sensor == "wheels"]
+    assert reasons == 240 * [(Outcome.REJECTED, THINNED)]

@@ -32,6 +32,7 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import BodyVelocity, GnssPosition
 from graphloc.recording import Recording
 from graphloc.replay import replay
+from graphloc.thinning import THINNED
 from tests.bagfactory import START_NS, Messages
 from tests.slowly import simulate_slowly
 
@@ -166,6 +167,17 @@ def test_the_batch_finds_the_current() -> None:
     used = [row for row in solution.ledger if row.sensor == "log"]
     assert len(used) == sum(isinstance(m, BodyVelocity) for m in run.recording.measurements)
     assert sum(row.outcome is Outcome.USED for row in used) > 0.9 * len(used)
+
+
+def test_online_what_is_faster_than_it_errs_anew_is_thinned() -> None:
+    """Each velocity said again 10 ms later, as of wheels at 100 Hz: a row, and no factor."""
+    scenario = Scenario(path="loops", duration_s=20.0, gnss_hz=2.0, pose_hz=0.0, log_hz=5.0, log_through="ground")
+    run = simulate_slowly(scenario, 3)
+    said = [m for m in run.recording.measurements if isinstance(m, BodyVelocity)]
+    again = [replace(m, stamp_ns=m.stamp_ns + 10_000_000, seq=10**6 + m.seq) for m in said]
+    every = tuple(sorted([*run.recording.measurements, *again], key=lambda m: m.stamp_ns))
+    rows = list(replay(replace(run.recording, measurements=every), run.config).solution.ledger)
+    assert {row.seq for row in rows if row.reason == THINNED} == {m.seq for m in again}
 
 
 def on_wheels(run: SimulatedRun, off_m: float, turned_deg: float) -> Recording:
