@@ -17,11 +17,11 @@ from graphloc.graph import TIME_OFFSET, Constant, SlowProcess, corrections
 from graphloc.position_jumps import jump_warnings, largest_sigma
 from graphloc.series import runs
 from graphloc.solution import Graded, SolveStats
-from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
+from graphloc.solve._batch import BatchResult
 from graphloc.solve._decide import AGREES, Verdict
 from graphloc.solve._health import CONTRADICTING_COST, FAR_OFF, late_of
 from graphloc.solve._imu_mount import MountError, mount_sigma_rad
-from graphloc.solve._imu_noise import too_quiet
+from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE, too_quiet
 from graphloc.solve._lasting import lasting
 from graphloc.solve._passes import expected_cost
 from graphloc.time import stamps_of, utc_text
