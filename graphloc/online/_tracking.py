@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 from bisect import insort
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from dataclasses import replace
 
@@ -396,9 +396,9 @@ class Tracking:
         """
         failed, recent, ledger = self.lag, self._recent, self._ledger
         ledger.enter(failed.gone())
-        anchors = [a for a in recent.anchors if a.stamp_ns >= failed.first_ns]
+        anchors = self._anchors()
         for anchor, without in [(anchors[0], False), (anchors[-1], True)] if anchors else []:
-            again = [m for m in self.since(anchor.stamp_ns) if not isinstance(m, ImuSample)]
+            again = self._again_from(anchor)
             mark = ledger.marked()
             try:
                 self._rebuild_from(anchor, [] if without else again, until_ns)
@@ -422,6 +422,14 @@ class Tracking:
         self.lag, self._pending = failed, [m for m in recent.others() if not ledger.has(m) and m.seq not in held]
         raise SolveError(f"{why}, and the window could not be rebuilt from an earlier state")
 
+    def _anchors(self) -> list[Anchor]:
+        """Return the anchors in the window, by stamp."""
+        return [a for a in self._recent.anchors if a.stamp_ns >= self.lag.first_ns]
+
+    def _again_from(self, anchor: Anchor) -> list[Measurement]:
+        """Return what can be used again in a window that begins at an anchor, but for the IMU samples, by stamp."""
+        return [m for m in self.since(anchor.stamp_ns) if not isinstance(m, ImuSample)]
+
     def _rebuild_from(self, anchor: Anchor, measurements: Sequence[Measurement], until_ns: int) -> None:
         self._unread, self._holes, self._pending = [], [], list(measurements)
         self.lag = self._built(anchor, self._recent.samples(), before=self.lag)
@@ -437,24 +445,13 @@ class Tracking:
         Returns:
             None: nothing has changed. Else the window is another, and this is to be said; empty: it was said before.
         """
-        denied = self.lag.denied
+        denied, replaced, anchors = self.lag.denied, self.lag, self._anchors()
         since_ns = self._doubt.suspected(denied, until_ns) if denied else None
-        failed, recent, ledger, persistent = self.lag, self._recent, self._ledger, self._persistent
-        anchors = [a for a in recent.anchors if failed.first_ns <= a.stamp_ns]
         if since_ns is None or not anchors or anchors[0].stamp_ns >= since_ns:
             return None
-        ledger.enter(failed.gone())
-        mark, doubt, pending, heights = ledger.marked(), deepcopy(self._doubt), self._pending, self._height_due_ns
-        # What learns from each measurement, and would from the trial as well.
-        receivers, check, model = persistent.receivers, persistent.heading_check, persistent.motion_model
-        scatters = {name: deepcopy(stream.scatter) for name, stream in failed.problem.streams.items()}
-        persistent.receivers, persistent.motion_model = deepcopy(receivers), deepcopy(model)
-        persistent.heading_check = HeadingCheck()  # its accelerations are wrong
-        for receiver in persistent.receivers.values():
-            receiver.jump.forget_since(since_ns)
-        self._doubt.leave_out(since_ns, until_ns)
-        out = recent.leave_out(since_ns)
-        again = [m for m in self.since(anchors[0].stamp_ns) if not isinstance(m, ImuSample)]
+        self._ledger.enter(replaced.gone())
+        again, said_before = self._again_from(anchors[0]), self._doubt.underway
+        take_back = self._begin_trial(since_ns, until_ns)
         try:
             self._rebuild_from(anchors[0], again, until_ns)
             explained = self.lag.explained(denied, min(denied.values()))
@@ -462,25 +459,44 @@ class Tracking:
             log.warning("online: the IMU could not be tried as wrong: %s", in_one_line(error))
             explained = False
         if not explained:
-            ledger.back_to(mark)
-            self.lag, self._pending, self._doubt = failed, pending, doubt
-            persistent.receivers, persistent.heading_check, persistent.motion_model = receivers, check, model
-            self._height_due_ns = heights
-            for name, stream in failed.problem.streams.items():
-                stream.scatter = scatters[name]
-            for m in out:
-                recent.keep(m)
+            take_back()
             return None
         self._held_out = []
         self._doubt.forget(self.lag.first_ns)
-        recent.forget_anchors(since_ns)
-        self._settle_rows(failed, again)
-        if doubt.underway:
+        self._recent.forget_anchors(since_ns)
+        self._settle_rows(replaced, again)
+        if said_before:
             return ""
         return (
             f"{self._setup.imu_name}: from {utc_text(since_ns)} on it {WHY} ({', '.join(sorted(denied))}): its samples are left out, as in "
             "an IMU gap, until they fit again"
         )
+
+    def _begin_trial(self, since_ns: int, until_ns: int) -> Callable[[], None]:
+        """Leave out the samples of the IMU between two stamps, and let the window be rebuilt; return what takes back both."""
+        ledger, recent, persistent = self._ledger, self._recent, self._persistent
+        mark, lag, pending, height_due_ns = ledger.marked(), self.lag, self._pending, self._height_due_ns
+        doubt = deepcopy(self._doubt)
+        # What learns from each measurement would from the trial as well, so that one has copies.
+        receivers, check, model = persistent.receivers, persistent.heading_check, persistent.motion_model
+        scatters = {name: deepcopy(stream.scatter) for name, stream in lag.problem.streams.items()}
+        persistent.receivers, persistent.motion_model = deepcopy(receivers), deepcopy(model)
+        persistent.heading_check = HeadingCheck()  # its accelerations are wrong
+        for receiver in persistent.receivers.values():
+            receiver.jump.forget_since(since_ns)
+        self._doubt.leave_out(since_ns, until_ns)
+        out = recent.leave_out(since_ns)
+
+        def take_back() -> None:
+            ledger.back_to(mark)
+            self.lag, self._pending, self._height_due_ns, self._doubt = lag, pending, height_due_ns, doubt
+            persistent.receivers, persistent.heading_check, persistent.motion_model = receivers, check, model
+            for name, stream in lag.problem.streams.items():
+                stream.scatter = scatters[name]
+            for m in out:
+                recent.keep(m)
+
+        return take_back
 
     def _goes_on_wrong(self) -> bool | None:
         """Return whether the samples that were left out last contradict the states that were made without them; None: too few to tell."""
