@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import in_one_line
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import ImuSample
@@ -20,7 +19,7 @@ from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import ErrorSizes
 from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE
 
-_VERSION = 8
+_VERSION = 9
 _EVERY_S = 2.0
 _MOST_TIMES = 1e4  # of a data sheet's noise, that an IMU on any engine has
 
@@ -36,7 +35,7 @@ class Snapshot:
             and on that of the accelerometer. sensor_noise: those of other sensors' sigmas (`SensorNoise.times`).
         heading: where no sensor measures it, how far it may be off.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
-        settings: by sensor, what slow states and constants in the anchor are added to (`settings_of`).
+        settings: by sensor, what slow states and constants in the anchor are, and what they are added to (`Setup.settings`).
         unmodelled: sizes of `UnmodelledError`; None where no slow error is left out, and the IMU's mount is right.
     """
 
@@ -54,9 +53,12 @@ class Snapshot:
     settings: Mapping[str, Any]
     unmodelled: ErrorSizes | None
 
-    def anchor_for(self, config: VesselConfig) -> Anchor:
-        """Return the anchor without what is known of sensors that are set otherwise now: corrected as told, they would be corrected twice."""
-        now = settings_of(config)
+    def anchor_for(self, now: Mapping[str, Any]) -> Anchor:
+        """Return the anchor without what is known of sensors that are set otherwise now: corrected as told, they would be corrected twice.
+
+        Args:
+            now: `Setup.settings`.
+        """
         same = {name for name, were in self.settings.items() if were == now.get(name)}
         return replace(
             self.anchor,
@@ -141,24 +143,6 @@ class Snapshot:
             settings=dict(raw["settings"]),
             unmodelled=ErrorSizes(*sizes) if sizes else None,
         )
-
-
-def settings_of(config: VesselConfig) -> dict[str, Any]:
-    """Return by sensor, as plain data, what its slow state and constants are added to: axes, mounts, time offset, survey, height; and which it has."""
-    said = {"axes", "through", "mount", "cameras", "lidars", "time_offset_s", "survey", "height_m"}
-    return {
-        name: {**sensor.model_dump(mode="json", include=said), "unknown": _unknown(sensor)}
-        for name, sensor in config.sensors.items()
-    }
-
-
-def _unknown(sensor: SensorConfig) -> list[str]:
-    """Return which parts the slow state of a speed or of poses has, of those that are left out where their sigma is 0."""
-    if not hasattr(sensor, "axes"):
-        return []
-    sigmas = sensor.model_dump(include={"scale_sigma", "mount_sigma_m", "mount_sigma_deg", "slow_error"})
-    sigmas |= sigmas.pop("slow_error", {})
-    return [key for key, sigma in sigmas.items() if sigma]
 
 
 class SnapshotFile:

@@ -378,7 +378,7 @@ class Tracking:
         """Return the last anchor and all that is needed to go on from it; `newest`: sample of the IMU."""
         anchor = self._recent.anchors[-1]
         sample = self._recent.sample_at(anchor) or newest
-        return self._persistent.snapshot(self._setup.config, anchor, sample, self.lag.agreed_ns)
+        return self._persistent.snapshot(self._setup, anchor, sample, self.lag.agreed_ns)
 
     # Rebuild, end
 
