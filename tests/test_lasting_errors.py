@@ -19,11 +19,13 @@ from graphloc.config import (
     PoseConfig,
     SensorConfig,
     VesselConfig,
+    parse_config,
 )
+from graphloc.errors import ConfigError
 from graphloc.eval.ekf import run_honest
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun
-from graphloc.factors import pose
+from graphloc.factors import KINDS, pose
 from graphloc.frames import Array, Datum
 from graphloc.graph import Decision
 from graphloc.measurements import Measurement, PoseFix
@@ -129,6 +131,23 @@ def test_a_restart_does_not_take_one_unknown_for_another(block: SensorConfig, wa
     )
     assert first == same
     assert first != other
+
+
+def test_how_long_it_lasts_is_refused_where_it_has_no_size() -> None:
+    """It did nothing, and nothing was said; an effective configuration states it, too."""
+    block = {"kind": "pose", "topic": "/usbl", "slow_error": {"time_constant_s": 40.0}}
+    with pytest.raises(
+        ConfigError, match=r"^v: sensors\.usbl\.slow_error: time_constant_s .* set sigma_m or sigma_deg"
+    ):
+        parse_config({"sensors": {"usbl": block}}, KINDS, "v")
+    sized = parse_config(
+        {"sensors": {"usbl": {**block, "slow_error": {"time_constant_s": 40.0, "sigma_m": 1.0}}}},
+        KINDS,
+        "v",
+    )
+    assert sized.sensors["usbl"].slow_error.time_constant_s == 40.0
+    stated = PoseConfig(topic="/usbl").model_dump(mode="json")
+    assert parse_config({"sensors": {"usbl": stated}}, KINDS, "v").sensors["usbl"] == PoseConfig(topic="/usbl")
 
 
 def test_the_honest_filter_is_told_of_it() -> None:
