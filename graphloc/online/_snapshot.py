@@ -105,44 +105,48 @@ class Snapshot:
             raise ValueError("written by another version of graphloc")
         stamp, *six = raw["imu"]
         p, R = (np.array(raw["odom"][n], dtype=np.float64).reshape(shape) for n, shape in ((0, 3), (1, (3, 3))))
-        heights_m = {str(n): float(h) for n, h in raw["heights_m"].items()}
         scale, gyro, accel = (float(times) for times in raw["noise"])
-        sensor_noise = {
-            str(name): {str(key): float(by) for key, by in times.items()} for name, times in raw["sensor_noise"].items()
-        }
-        datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
         sizes = [np.array(of, dtype=np.float64) for of in raw["unmodelled"] or ()]
-        heading = None if raw["heading"] is None else UnmeasuredHeading(**raw["heading"])
-        raised = [scale, gyro, accel, *(by for times in sensor_noise.values() for by in times.values())]
-        numbers = np.concatenate(
-            [
-                p,
-                R.ravel(),
-                datum.origin,
-                list(heights_m.values()),
-                raised,
-                *(of.ravel() for of in sizes),
-                [] if heading is None else [heading.since_ns, heading.sigma_rad, heading.drift_radps],
-            ]
-        )
-        no_noise = not 1.0 <= min(raised) or scale > LARGEST_NOISE_SCALE or max(raised) > _MOST_TIMES
-        if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or no_noise:
-            raise ValueError("it is damaged")
-        return cls(
+        found = cls(
             vessel=str(raw["vessel"]),
             anchor=Anchor.from_dict(raw["anchor"]),
             imu=ImuSample(stamp_ns=int(stamp), sensor=sensor, seq=-1, accel_mps2=six[:3], gyro_radps=six[3:]),
-            datum=datum,
-            heights_m=heights_m,
+            datum=Datum(Geodetic(*(float(v) for v in raw["datum"]))),
+            heights_m={str(n): float(h) for n, h in raw["heights_m"].items()},
             agreed_ns={str(n): int(s) for n, s in raw["agreed_ns"].items()},
             noise=(scale, gyro, accel),
-            sensor_noise=sensor_noise,
-            heading=heading,
+            sensor_noise={
+                str(name): {str(key): float(by) for key, by in times.items()}
+                for name, times in raw["sensor_noise"].items()
+            },
+            heading=None if raw["heading"] is None else UnmeasuredHeading(**raw["heading"]),
             p_odom_m=p,
             R_odom_body=R,
             settings=dict(raw["settings"]),
             unmodelled=ErrorSizes(*sizes) if sizes else None,
         )
+        if not found._is_sound():
+            raise ValueError("it is damaged")
+        return found
+
+    def _is_sound(self) -> bool:
+        """Whether its numbers, those of the anchor and of the sample aside, are ones that a run can have had."""
+        scale, heading, R = self.noise[0], self.heading, self.R_odom_body
+        raised = [*self.noise, *(by for times in self.sensor_noise.values() for by in times.values())]
+        numbers = np.concatenate(
+            [
+                self.p_odom_m,
+                R.ravel(),
+                self.datum.origin,
+                list(self.heights_m.values()),
+                raised,
+                *(of.ravel() for of in self.unmodelled or ()),
+                [] if heading is None else [heading.since_ns, heading.sigma_rad, heading.drift_radps],
+            ]
+        )
+        finite = bool(np.isfinite(numbers).all())
+        noise = 1.0 <= min(raised) and scale <= LARGEST_NOISE_SCALE and max(raised) <= _MOST_TIMES
+        return finite and noise and bool(np.abs(R @ R.T - np.eye(3)).max() <= 1e-3)
 
 
 class SnapshotFile:
