@@ -21,6 +21,7 @@ from graphloc.measurements import ImuSample, ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._estimates import estimate_of
 from graphloc.online._heading_check import HeadingCheck
+from graphloc.online._heading_guess import HeadingGuess
 from graphloc.online._imu_doubt import ImuDoubt, turns_otherwise
 from graphloc.online._intake import series_of
 from graphloc.online._lag import Lag
@@ -32,7 +33,6 @@ from graphloc.online._propagate import advance_odometry, propagate, unpropagated
 from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
-from graphloc.online._start import LEAST_S
 from graphloc.solve._wrong_imu import WHY
 from graphloc.time import duration_ns, stamps_of, utc_text
 from graphloc.trajectory import Trajectory
@@ -40,7 +40,6 @@ from graphloc.trajectory import Trajectory
 log = logging.getLogger(__name__)
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
 _PENDING = 10_000  # measurements that may wait for the IMU
-_HEADINGS, _KEPT_HEADINGS = 3, 1000  # measurements of the heading that end a guess; that are remembered
 _TOLD_S = 60.0  # of data, by which the motion may tell a heading that was a guess
 _FROZEN = "frozen receiver: it repeats one position while the vessel moves; its fixes are rejected until it moves"
 _NO_LONGER_FROZEN = "no longer frozen: its fixes are used again"
@@ -83,8 +82,7 @@ class Tracking:
             place = np.asarray(pose.transformFrom(-self.lag.problem.t_body_imu_m))
             persistent.odometry = Odometry(anchor.stamp_ns, place, pose.rotation().matrix())
         self._odometry = persistent.odometry
-        self._guessed = False  # whether an event said that the heading is a guess
-        self._headed_ns: deque[int] = deque(maxlen=_KEPT_HEADINGS)  # stamps of measurements of it, while none was known
+        self._guess = HeadingGuess()
 
     def _built(
         self,
@@ -132,7 +130,7 @@ class Tracking:
         insort(self._pending, m, key=lambda p: p.stamp_ns)
         self._recent.keep(m)
         if self._persistent.heading is not None and np.isfinite(self._setup.hint(m, self.lag.problem.datum).yaw_rad):
-            self._headed_ns.append(m.stamp_ns)
+            self._guess.note(m.stamp_ns)
         if len(self._pending) > _PENDING:
             self._ledger.drop(self._pending.pop(), Outcome.REJECTED, "too many measurements wait for the IMU")
 
@@ -305,8 +303,7 @@ class Tracking:
 
     def heading_measured(self) -> bool:
         """Return whether sensors have measured the heading in the window, for as long as a start takes."""
-        told_ns = [at_ns for at_ns in self._headed_ns if at_ns >= self.lag.first_ns]
-        return len(told_ns) >= _HEADINGS and self.lag.newest.stamp_ns - min(told_ns) >= duration_ns(LEAST_S)
+        return self._guess.measured(self.lag.first_ns, self.lag.newest.stamp_ns)
 
     def since(self, stamp_ns: int) -> list[Measurement]:
         """Return what has come with stamps from `stamp_ns` on and can be used again, by stamp: what came late is among it."""
@@ -344,7 +341,9 @@ class Tracking:
         check, at_ns, known = self._persistent.heading_check, self.lag.newest.stamp_ns, self._persistent.heading
         guessed = known is not None and known.doubt(at_ns) != ""
         heading = [Event(check.said)] if check.look(self.lag, guessed=guessed) else []
-        heading += self._heading_news()
+        if known is not None:
+            self._persistent.heading, said = self._guess.follow(known, check, self.lag.first_ns, at_ns)
+            heading += said
         was, now = self._persistent.frozen, self.lag.frozen_receivers
         self._persistent.frozen = now
         frozen = [Event(f"{name}: {_FROZEN}") for name in sorted(now - was)]
@@ -359,20 +358,6 @@ class Tracking:
             *fits,
             *map(Event, [*self.lag.receiver_warnings(), *self.lag.noisier_warnings(), *self.lag.setting_warnings()]),
         ]
-
-    def _heading_news(self) -> list[Event]:
-        """Follow a heading that no sensor measures; return that it is a guess by now, or is none any more."""
-        known, at_ns, check = self._persistent.heading, self.lag.newest.stamp_ns, self._persistent.heading_check
-        if known is None:
-            return []
-        self._persistent.heading = known = known.narrowed(check.looked_ns, check.within_rad)
-        why, said = known.doubt(at_ns), self._guessed
-        if check.confirmed or (not why and self.heading_measured()):
-            self._persistent.heading, self._guessed = None, False
-            confirmed = Event("the motion confirms the heading: it is no guess any more", warns=False)
-            return [confirmed] if said and check.confirmed else []
-        self._guessed = said or bool(why)
-        return [Event(why, heading_guessed=True)] if why and not said else []
 
     def snapshot(self, newest: ImuSample) -> Snapshot:
         """Return the last anchor and all that is needed to go on from it; `newest`: sample of the IMU."""
