@@ -51,14 +51,16 @@ def as_they_scatter(
     problem: Problem, few: Thinned, estimate: gtsam.Values, prior: StartPrior, progress: Progress
 ) -> SolvedRun:
     """Make the final passes, again with larger sigmas of the sensors that scatter more than they state (see `_sensor_noise`)."""
-    passes = iterations = 0
-    for more in range(MAX_SENSOR_ROUNDS, -1, -1):
-        settled = _final_passes(problem, few, estimate, prior, progress)
-        passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
-        if not more or not (times := scattering(problem, settled.verdicts)):
+    settled, passes, iterations = _final_passes(problem, few, estimate, prior, progress), 0, 0
+    for _ in range(MAX_SENSOR_ROUNDS):
+        times = scattering(problem, settled.verdicts)
+        if not times:
             break
-        problem = with_sensor_noise(problem, times)
-        few = thinned(problem)
+        passes, iterations = passes + settled.passes, iterations + settled.iterations
+        problem, estimate = with_sensor_noise(problem, times), settled.values
+        del settled  # and its graph, before the next one is made
+        settled = _final_passes(problem, thinned(problem), estimate, prior, progress)
+    passes, iterations = passes + settled.passes, iterations + settled.iterations
     return SolvedRun(problem, replace(settled, passes=passes, iterations=iterations))
 
 
