@@ -13,12 +13,14 @@ the limit is 3 sigmas, since a mix-up of geoid and ellipsoid gives far more.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.build import mount_of
 from graphloc.chi2 import chi2_95
-from graphloc.config import VesselConfig
+from graphloc.config import SlowErrorConfig, VesselConfig
 from graphloc.eval.metrics import Levers, receiver_errors
 from graphloc.frames import Array, Datum, heading_deg_from_yaw
 from graphloc.measurements import GnssPosition
@@ -43,7 +45,7 @@ def gnss_offset_warnings(
         config: sensors, their slow errors and mounts.
         antennas_off_m: (3,) m each, by receiver, how far from its mount the track has its antenna, where it estimates that.
     """
-    lines = []
+    lines = list[str]()
     measured = {m.sensor for m in recording.measurements if m.seq >= 0}
     for name, sensor in config.of_kind("gnss").items():
         others = [
@@ -60,27 +62,39 @@ def gnss_offset_warnings(
         if len(off) < _FEWEST:
             continue
         process, lasts_s = sensor.slow_error, float(stamps[-1] - stamps[0]) / NS_PER_S
-        size, mean = _steady(off[:, :2])
-        if size**2 >= chi2_95(2) * _mean_variance(process.horizontal_sigma_m, process.time_constant_s, lasts_s):
-            towards = float(heading_deg_from_yaw(np.arctan2(mean[1], mean[0])))
-            lines.append(
-                f"{name} has a constant offset of {size:.1f} m (towards {towards:.0f} deg) from {', '.join(others)}, more than its slow "
-                f"error of {process.horizontal_sigma_m:.1f} m (1 sigma) explains: the map, the survey, the datum or a lever arm is "
-                "off by that much, or the receiver is; the track follows the others"
-            )
-        if any(not m.has_height for m in fixes):
-            continue
-        size, mean = _steady(off[:, 2:])
-        others = [n for n in others if config.sensors[n].tells_height] + list(config.of_kind("height"))
-        if others and size**2 >= _HEIGHT_SIGMAS**2 * _mean_variance(
-            process.vertical_sigma_m, process.time_constant_s, lasts_s
-        ):
-            lines.append(
-                f"{name} has a constant offset of {size:.1f} m ({'up' if mean[0] > 0.0 else 'down'}) from {', '.join(others)}, more "
-                f"than its slow error of {process.vertical_sigma_m:.1f} m in height (1 sigma) explains: one may be above the geoid, "
-                "the other above the ellipsoid"
-            )
+        lines += _horizontal(name, off[:, :2], process, lasts_s, others)
+        if all(m.has_height for m in fixes):
+            tell = [n for n in others if config.sensors[n].tells_height] + list(config.of_kind("height"))
+            lines += _vertical(name, off[:, 2:], process, lasts_s, tell)
     return lines
+
+
+def _horizontal(
+    name: str, off_m: Array, process: SlowErrorConfig, lasts_s: float, others: Sequence[str]
+) -> Iterator[str]:
+    """Yield a line if a receiver's errors (N, 2), m, of a run of `lasts_s` are more than its slow error explains."""
+    size, mean = _steady(off_m)
+    if size**2 >= chi2_95(2) * _mean_variance(process.horizontal_sigma_m, process.time_constant_s, lasts_s):
+        towards = float(heading_deg_from_yaw(np.arctan2(mean[1], mean[0])))
+        yield (
+            f"{name} has a constant offset of {size:.1f} m (towards {towards:.0f} deg) from {', '.join(others)}, more than its slow "
+            f"error of {process.horizontal_sigma_m:.1f} m (1 sigma) explains: the map, the survey, the datum or a lever arm is "
+            "off by that much, or the receiver is; the track follows the others"
+        )
+
+
+def _vertical(
+    name: str, off_m: Array, process: SlowErrorConfig, lasts_s: float, others: Sequence[str]
+) -> Iterator[str]:
+    """Yield the same of its errors (N, 1) in height; `others`: what else tells the height."""
+    size, mean = _steady(off_m)
+    variance = _mean_variance(process.vertical_sigma_m, process.time_constant_s, lasts_s)
+    if others and size**2 >= _HEIGHT_SIGMAS**2 * variance:
+        yield (
+            f"{name} has a constant offset of {size:.1f} m ({'up' if mean[0] > 0.0 else 'down'}) from {', '.join(others)}, more "
+            f"than its slow error of {process.vertical_sigma_m:.1f} m in height (1 sigma) explains: one may be above the geoid, "
+            "the other above the ellipsoid"
+        )
 
 
 def _steady(off_m: Array) -> tuple[float, Array]:

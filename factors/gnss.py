@@ -49,11 +49,6 @@ def white_covariance(m: GnssPosition, config: GnssConfig) -> Array:
     return with_floors(m.cov_enu_m2 * config.sigma_scale**2, np.array([horizontal, horizontal, vertical]))
 
 
-def _covariance(white: Array, at: Attachment) -> Array:
-    """Covariance (3, 3) of a fix about a slow error that is held between its nodes, m^2; `white`: of its white part."""
-    return white if at.slow_walk is None else white + np.diag(at.slow_walk)
-
-
 # A fix is asked for its place at every pass; remembered for as long as the fix itself is, however long a vessel is out.
 _PLACES: WeakKeyDictionary[GnssPosition, tuple[Datum, Array]] = WeakKeyDictionary()
 
@@ -95,7 +90,7 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
     """Residual predicted - measured (3,) in m, world axes."""
     raw = _predicted_m(at, config) - _fix_world_m(m, at)
     white = white_covariance(m, config)
-    cov = _covariance(white, at)
+    cov = white + at.walked()
     return (
         Residual(
             raw=raw,
@@ -118,7 +113,7 @@ def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decis
         return None
     z = _fix_world_m(m, at)
     lever = np.asarray(at.T_state_sensor.translation())
-    model = noise_model(_covariance(white_covariance(m, config), at), decision)
+    model = noise_model(white_covariance(m, config) + at.walked(), decision)
     if at.slow_key is None:
         return GraphUpdate(factors=(gtsam.GPSFactorArm(at.pose_key, z, lever, model),))
     antenna_key, lever_key = at.leaf_keys

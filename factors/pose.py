@@ -116,13 +116,12 @@ def residuals(m: PoseFix, config: PoseConfig, at: Attachment) -> tuple[Residual,
     found = tuple(with_slow(plain, m.axes, at.slow_value, shown, plain.jacobian()) for plain in found)
     if at.slow_walk is None:
         return found
-    walk = shown @ np.diag(at.slow_walk) @ shown.T
-    return tuple(_walked(residual, walk) for residual in found)
+    return tuple(_walked(residual, at.walked(shown)) for residual in found)
 
 
-def _walked(residual: Residual, walk: Array) -> Residual:
+def _walked(residual: Residual, by: Array | float) -> Residual:
     """Return a residual with what its slow error walks by between its nodes (k, k)."""
-    cov = residual.cov + walk
+    cov = residual.cov + by
     expected = float(np.trace(np.linalg.solve(cov, residual.cov)))
     return replace(residual, cov=cov, white=residual.cov, expected_nis=expected)
 

@@ -313,6 +313,19 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
     VTG is on the line; so does a GPSFix. A maker's message gives a stream of the equivalent type for each thing that it says. A Doppler log's
     velocities through water are one named 'TOPIC (through water)', what a filter made one named 'TOPIC (of a filter)'.
     """
+    streams, tree = _empty_streams(bag), StaticTree()
+    _fill(streams, tree, bag)
+    tree.settle()
+    _join_talkers(streams)
+    for name in _of_no_use(streams):
+        del streams[name]
+    for stream in streams.values():
+        stream.settle()
+    return [_named_as_filters(stream) for stream in streams.values()], tree
+
+
+def _empty_streams(bag: Bag) -> dict[str, TopicData]:
+    """Return the streams of topics that can be one by their type and name, by their own names; sentences make theirs as they come."""
     streams = {
         t.topic: TopicData(t.topic, t.msgtypes[0])
         for t in bag.topics.values()
@@ -326,7 +339,11 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
         ):
             for name, part in _parts(t.topic, t.msgtypes[0]):
                 streams[name] = TopicData(name, _LIKE[part.kind][0], part=part)
-    tree = StaticTree()
+    return streams
+
+
+def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> None:
+    """Read the messages of a bag into streams and transforms, in place."""
     mixed = {t.topic for t in bag.topics.values() if len(t.msgtypes) == 1 and t.msgtypes[0] in NMEA}
     wanted = set(streams) | mixed | ({TF_STATIC, TF_MOVING} & set(bag.topics))
     for raw in bag.messages(wanted) if wanted else ():
@@ -342,26 +359,29 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
         if raw.topic == TF_STATIC:
             tree.take(raw.msgtype, msg)
         for stream, row in said:
-            if row is None:
-                stream.undecodable += 1
-                continue
-            stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns)
-            if raw.msgtype not in UNSTAMPED:
-                header = getattr(msg, "header", None)
-                stream.frame_id = stream.frame_id or str(getattr(header, "frame_id", "")).lstrip("/")
-            stream.add(stamp_ns or 0, raw.log_ns, row, raw.file, raw.elapsed_ns)
-    tree.settle()
-    _join_talkers(streams)
-    for name in [
+            _add(stream, row, raw, msg)
+
+
+def _add(stream: TopicData, row: Row | None, raw: RawMessage, msg: Any) -> None:
+    """Add what a message says to a stream; None: nothing that could be decoded."""
+    if row is None:
+        stream.undecodable += 1
+        return
+    stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns)
+    if raw.msgtype not in UNSTAMPED:
+        header = getattr(msg, "header", None)
+        stream.frame_id = stream.frame_id or str(getattr(header, "frame_id", "")).lstrip("/")
+    stream.add(stamp_ns or 0, raw.log_ns, row, raw.file, raw.elapsed_ns)
+
+
+def _of_no_use(streams: Mapping[str, TopicData]) -> list[str]:
+    """Return the names of streams that say nothing, or what others say as well."""
+    return [
         name
         for name, stream in streams.items()
         if (name.endswith((COURSE, HEADING)) and _told_elsewhere(stream, streams))
         or (name + WATER in streams and not np.isfinite(stream.rows).any())
-    ]:
-        del streams[name]
-    for stream in streams.values():
-        stream.settle()
-    return [_named_as_filters(stream) for stream in streams.values()], tree
+    ]
 
 
 def _named_as_filters(stream: TopicData) -> TopicData:

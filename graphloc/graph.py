@@ -99,6 +99,17 @@ class Attachment:
     T_solver: Any | None = None
     felt: FeltMotion | None = None
 
+    def walked(self, shown: Array | None = None) -> Array | float:
+        """Return the covariance (k, k) that `slow_walk` adds to a measurement; 0 where there is no slow state.
+
+        Args:
+            shown: (k, n) d measurement / d (slow state); default: the measurement shows each of its axes.
+        """
+        if self.slow_walk is None:
+            return 0.0
+        walk = np.diag(self.slow_walk)
+        return walk if shown is None else np.asarray(shown @ walk @ shown.T)
+
     def swing_mps(self, off_m: Array | None = None) -> Array:
         """Return the velocity (3,) of the sensor by the turning of the body, w x l, body axes, m/s.
 
@@ -141,7 +152,7 @@ class Residual:
         slow_jacobian: gives (k, n) d raw / d (slow state), for the same; None: it has no part in that.
         velocity_jacobian: gives (k, 3) d raw / d (velocity in world), for the same; None: it has no part in that.
         constant_jacobians: gives (k, n) d raw / d (each of the attachment's constants), for its factor.
-        white: (k, k) covariance of what it does not share with the measurements beside it; None: all of `cov`.
+        white: (k, k) covariance of what it does not share with the measurements beside it; None: all of `cov` (see `white_cov`).
         expected_nis: expected square of the factor; None: that of its length, one per axis.
         prior: prior probability of this hypothesis.
         size_m, size_deg: physical size, for the ledger.
@@ -158,6 +169,11 @@ class Residual:
     constant_jacobians: Callable[[], tuple[Array, ...]] = tuple
     white: Array | None = None
     expected_nis: float | None = None
+
+    @property
+    def white_cov(self) -> Array:
+        """Covariance (k, k) of what it does not share with the measurements beside it."""
+        return self.cov if self.white is None else self.white
 
     def _spread(self, inflation: Array | None) -> Array:
         return self.cov if inflation is None else self.cov + inflation

@@ -60,7 +60,7 @@ class SlowEstimate:
 
     Attributes:
         name: what it is, for axis labels, e.g. 'GNSS error'.
-        axes: names of the k columns. units: of each, 'm' or 'deg'.
+        axes: names of the k columns. units: of each, such as 'm', 'deg' or 's'.
         stamps_ns: (M,); value, sigma: (M, k).
     """
 

@@ -214,7 +214,7 @@ def test_ctrl_c_in_the_solver_ends_at_once(tmp_path: Path) -> None:
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a `nohup` runner ignores it
         "from graphloc import cli; from graphloc.solve import _start; grow = _start.solve_start\n"
         "def told(*a, **k): print('solving', flush=True); return grow(*a, **k)\n"
-        "import graphloc.solve._batch as b; b.solve_start = told\n"
+        "import graphloc.solve._first_solution as b; b.solve_start = told\n"
         f"sys.argv = {['graphloc', *map(str, command[3:])]!r}; cli.main()"
     )
     started = subprocess.Popen(

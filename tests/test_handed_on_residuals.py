@@ -15,7 +15,7 @@ from graphloc.eval.simulate import bl_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.graph import Residual, Sensor
 from graphloc.linear import factors_of
-from graphloc.solve import _batch, smooth
+from graphloc.solve import _final_passes, smooth
 from graphloc.solve._choices import other_choices
 from tests.slowly import sparsely
 
@@ -48,7 +48,7 @@ def test_a_residual_that_is_handed_on_is_that_at_its_attachment(monkeypatch: pyt
             yield others, used
 
     monkeypatch.setattr(_graph, "factors_of", checked)
-    monkeypatch.setattr(_batch, "other_choices", choices)
+    monkeypatch.setattr(_final_passes, "other_choices", choices)
     run = sparsely(simulate(replace(bl_scenario(3, "drift"), duration_s=40.0), 4))
     smooth(run.recording, run.config, app.choose_datum(run.recording, run.config), rows=SENSORS, inertial=INERTIAL)
     assert min(given[kind] for kind in ("gnss", "compass", "pose")) > 50

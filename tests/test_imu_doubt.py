@@ -26,7 +26,7 @@ from graphloc.online._lag import Lag
 from graphloc.online._tracking import Tracking
 from graphloc.recording import Recording, quiet
 from graphloc.solution import Health, Solution
-from graphloc.solve import _batch
+from graphloc.solve import _first_solution
 from graphloc.solve._start import Begun
 from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
 from tests.slowly import slowly
@@ -192,14 +192,14 @@ def test_offline_the_start_is_in_doubt_only_where_it_contradicts_itself(
         seen.append(doubt_start)
         raise SolveError("seen")
 
-    monkeypatch.setattr(_batch, "align", lambda _: None)
-    monkeypatch.setattr(_batch, "solve_start", lambda *_, **__: begun)
-    monkeypatch.setattr(_batch, "_begun_without_a_sensor", lambda *_: begun if told else None)
-    monkeypatch.setattr(_batch, "_doubt_at_once", lambda *_: None)
-    monkeypatch.setattr(_batch, "grow", grow)
+    monkeypatch.setattr(_first_solution, "align", lambda _: None)
+    monkeypatch.setattr(_first_solution, "solve_start", lambda *_, **__: begun)
+    monkeypatch.setattr(_first_solution, "_begun_without_a_sensor", lambda *_: begun if told else None)
+    monkeypatch.setattr(_first_solution, "_doubt_at_once", lambda *_: None)
+    monkeypatch.setattr(_first_solution, "grow", grow)
     few: Any = SimpleNamespace(problem=None)
     with pytest.raises(SolveError, match="seen"):
-        _batch._begin(few, few, quiet, newest=False, doubt_imu=True)  # noqa: SLF001
+        _first_solution._begin(few, few, quiet, newest=False, doubt_imu=True)  # noqa: SLF001
     assert seen == [excess > 2.5 and not told]
 
 

@@ -12,15 +12,24 @@ import pytest
 
 from graphloc import app
 from graphloc.build import Stream
-from graphloc.config import BodyVelocityConfig, PoseConfig, SensorConfig, VesselConfig
+from graphloc.config import (
+    AerialConfig,
+    BodyVelocityConfig,
+    CompassConfig,
+    PoseConfig,
+    SensorConfig,
+    VesselConfig,
+    parse_config,
+)
+from graphloc.errors import ConfigError
 from graphloc.eval.ekf import run_honest
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun
-from graphloc.factors import pose
+from graphloc.factors import KINDS, pose
 from graphloc.frames import Array, Datum
 from graphloc.graph import Decision
 from graphloc.measurements import Measurement, PoseFix
-from graphloc.online._snapshot import Snapshot, settings_of
+from graphloc.online._snapshot import Snapshot
 from graphloc.replay import replay
 from graphloc.solution import Graded
 from graphloc.solve._decide import Verdict
@@ -29,7 +38,7 @@ from graphloc.solve._warnings import _lasting_error
 from tests.faults import arrivals_of, feed
 from tests.slowly import simulate_slowly
 from tests.test_factors import attachment
-from tests.test_online_faults import smoother
+from tests.test_online_faults import setup_of, smoother
 
 SIGMA_M, TIME_S = 1.5, 40.0
 
@@ -96,11 +105,11 @@ def test_it_goes_on_after_a_restart_but_not_on_other_axes(tmp_path: Path) -> Non
     feed(smoother(run, snapshot=path), run, came)
     (name,) = run.config.of_kind("pose")
     snapshot = Snapshot.read(path, "imu")
-    assert np.abs(snapshot.anchor_for(run.config).slow[name].value).max() > 0.1
+    assert np.abs(snapshot.anchor_for(setup_of(run.config).settings).slow[name].value).max() > 0.1
     resumed = feed(smoother(run, snapshot=path), run, rest)
     assert any(e.startswith("resumed from a snapshot") for e in resumed.events)
     other = run.config.sensors[name].model_copy(update={"axes": ("x", "z")})
-    assert name not in snapshot.anchor_for(run.config.with_sensors({name: other})).slow
+    assert name not in snapshot.anchor_for(setup_of(run.config.with_sensors({name: other})).settings).slow
 
 
 @pytest.mark.parametrize(
@@ -109,16 +118,36 @@ def test_it_goes_on_after_a_restart_but_not_on_other_axes(tmp_path: Path) -> Non
         (BodyVelocityConfig(), {"scale_sigma": 0.05}, {"scale_sigma": 0.0, "mount_sigma_deg": 1.0}),
         (BodyVelocityConfig(scale_sigma=0.0), {"mount_sigma_m": 1.0}, {"scale_sigma": 0.05, "through": "water"}),
         (PoseConfig(axes=("z", "yaw")), {"slow_error": {"sigma_m": 1.0}}, {"slow_error": {"sigma_deg": 1.0}}),
+        (AerialConfig(mount_sigma_deg=0.0, stamp_sigma_s=0.0), {"image_sigma_m": 0.3}, {"image_sigma_m": 0.0}),
+        (CompassConfig(), {"wander_sigma_deg": 0.5}, {"wander_sigma_deg": 0.0}),
     ],
 )
 def test_a_restart_does_not_take_one_unknown_for_another(block: SensorConfig, was: Any, now: Any) -> None:
     """Of as many numbers: a scale of 2 % would be taken for a yaw of 1 deg."""
     told = block.model_dump()
     first, same, other = (
-        VesselConfig(sensors={"one": type(block).model_validate({**told, **keys})}) for keys in (was, was, now)
+        setup_of(VesselConfig(sensors={"one": type(block).model_validate({**told, **keys})})).settings
+        for keys in (was, was, now)
     )
-    assert settings_of(first) == settings_of(same)
-    assert settings_of(first) != settings_of(other)
+    assert first == same
+    assert first != other
+
+
+def test_how_long_it_lasts_is_refused_where_it_has_no_size() -> None:
+    """It did nothing, and nothing was said; an effective configuration states it, too."""
+    block = {"kind": "pose", "topic": "/usbl", "slow_error": {"time_constant_s": 40.0}}
+    with pytest.raises(
+        ConfigError, match=r"^v: sensors\.usbl\.slow_error: time_constant_s .* set sigma_m or sigma_deg"
+    ):
+        parse_config({"sensors": {"usbl": block}}, KINDS, "v")
+    sized = parse_config(
+        {"sensors": {"usbl": {**block, "slow_error": {"time_constant_s": 40.0, "sigma_m": 1.0}}}},
+        KINDS,
+        "v",
+    )
+    assert sized.sensors["usbl"].slow_error.time_constant_s == 40.0
+    stated = PoseConfig(topic="/usbl").model_dump(mode="json")
+    assert parse_config({"sensors": {"usbl": stated}}, KINDS, "v").sensors["usbl"] == PoseConfig(topic="/usbl")
 
 
 def test_the_honest_filter_is_told_of_it() -> None:

@@ -38,7 +38,7 @@ from tests.slowly import with_few_states
 from tests.test_factors import attachment, values_of
 from tests.test_inspect import drive
 from tests.test_inspect_sources import cloud
-from tests.test_online_faults import smoother
+from tests.test_online_faults import setup_of, smoother
 
 SCENARIO = Scenario(path="loops", noise="clean", false_fraction=0.0, gnss_hz=2.0, imu_hz=50.0, compass_hz=2.0)
 
@@ -223,12 +223,13 @@ def test_a_delay_that_was_found_goes_on_after_a_restart(tmp_path: Path) -> None:
         online = smoother(other, snapshot=copy)
         fed = feed(online, other, came[3 * len(came) // 4 :][: len(came) // 40])
         said = [e for e in fed.events if "snapshot" in e]
-        found[key] = said[0], name in snapshot.anchor_for(other.config).slow
+        found[key] = said[0], name in snapshot.anchor_for(setup_of(other.config).settings).slow
     assert found["on"][0].startswith("resumed from a snapshot")
     assert found["on"][1]
     assert found["set"][0].startswith("resumed from a snapshot")
     assert not found["set"][1]
-    assert "of another size" in found["exact"][0]
+    assert found["exact"][0].startswith("resumed from a snapshot")
+    assert not found["exact"][1]
 
 
 MAKE = Messages(2)

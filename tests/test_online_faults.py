@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from graphloc.config import GnssConfig
+from graphloc.config import GnssConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.factors.imu import Links
@@ -26,6 +26,7 @@ from graphloc.online._agreement import Agreement
 from graphloc.online._lag import Lag
 from graphloc.online._live import live_problem
 from graphloc.online._repeated_fix import RepeatedFixDetector
+from graphloc.online._setup import Setup
 from graphloc.online._window import Window
 from graphloc.time import stamps_of
 from tests.faults import FAULTS, Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
@@ -36,6 +37,10 @@ RATE_HZ = 2.5  # of states
 
 def smoother(run: SimulatedRun, **options: Any) -> OnlineSmoother:
     return OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL, **options)
+
+
+def setup_of(config: VesselConfig) -> Setup:
+    return Setup(config=config, rows=SENSORS, inertial=INERTIAL, mounts={}, lag_s=10.0)
 
 
 @cache

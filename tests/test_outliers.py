@@ -33,9 +33,9 @@ from graphloc.position_jumps import (
 from graphloc.recording import Recording
 from graphloc.replay import arrivals, replay
 from graphloc.solution import Health, Solution
-from graphloc.solve import _batch, _grow
-from graphloc.solve._batch import _first_solution
+from graphloc.solve import _batch, _first_solution, _grow
 from graphloc.solve._decide import Stage, _by_kernel, weigh
+from graphloc.solve._first_solution import first_solution
 from graphloc.solve._grow import grow
 from graphloc.solve._jumps import with_jumps_off_track
 from graphloc.solve._stretch import StretchStep, solve_stretch
@@ -95,7 +95,7 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one(monkeypatch
     bias while the run was grown, and the heading was 48 deg off.
     """
     run = simulate_slowly(replace(_FINE_FIXES, path="turn", duration_s=70.0, gnss_hz=2.0, compass_hz=2.0), 1, 1.25)
-    monkeypatch.setattr(_batch, "_OFTEN", np.inf)
+    monkeypatch.setattr(_first_solution, "_OFTEN", np.inf)
     grown_deg: list[float] = []
 
     def watched(problem: Any, values: Any, *args: Any, **options: Any) -> int:
@@ -105,7 +105,7 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one(monkeypatch
         grown_deg.append(float(np.degrees(np.abs(off).max())))
         return used
 
-    monkeypatch.setattr(_batch, "grow", watched)
+    monkeypatch.setattr(_first_solution, "grow", watched)
     off_deg, solved = _heading_off_deg(run, 90.0, 15.0, 50.0)
     assert len(grown_deg) == 1
     assert grown_deg[0] < 3.0
@@ -150,8 +150,8 @@ def test_a_sensor_agrees_by_its_loss_as_configured_not_as_widened(off: float) ->
 
 def test_outliers_in_a_row_are_told_from_scattered_ones() -> None:
     scattered = np.random.default_rng(1).random(200) < 0.4
-    assert not _batch._off_for_long(scattered)  # noqa: SLF001
-    assert _batch._off_for_long(np.sort(scattered))  # noqa: SLF001
+    assert not _first_solution._off_for_long(scattered)  # noqa: SLF001
+    assert _first_solution._off_for_long(np.sort(scattered))  # noqa: SLF001
 
 
 def test_a_compass_that_is_off_for_most_of_a_run_is_found_by_leaving_it_out() -> None:
@@ -594,10 +594,10 @@ def test_a_run_that_cannot_be_solved_with_its_jumps_is_solved_without(monkeypatc
     def only_without(given: Problem, *args: Any, **options: Any) -> Any:
         if given is jumped:
             raise SolveError("not with these")
-        return _first_solution(given, *args, **options)
+        return first_solution(given, *args, **options)
 
     monkeypatch.setattr(_batch, "with_jumps_off_track", lambda *_: jumped)
-    monkeypatch.setattr(_batch, "_first_solution", only_without)
+    monkeypatch.setattr(_batch, "first_solution", only_without)
     found = _batch.solve_batch(problem)
     assert found.stated is problem
     last = keys.pose(len(problem.timeline) - 1)
@@ -624,13 +624,13 @@ def test_jumps_found_with_noise_that_needs_another_start_are_stated(monkeypatch:
     seen, noisier = [None, jumped, None], [problem, None]
 
     def by_motion(*args: Any, **options: Any) -> Any:
-        begun, solved = _first_solution(*args, **options)
+        begun, solved = first_solution(*args, **options)
         return begun._replace(start=replace(begun.start, by_motion=True)), solved
 
     monkeypatch.setattr(_batch, "with_jumps_off_track", lambda *_: seen.pop(0))
     monkeypatch.setattr(_batch, "with_needed_noise", lambda *_: noisier.pop(0))
-    monkeypatch.setattr(_batch, "_first_solution", by_motion)
-    monkeypatch.setattr(_batch, "_CLEARLY", -np.inf)  # these fixes do not jump
+    monkeypatch.setattr(_batch, "first_solution", by_motion)
+    monkeypatch.setattr(_batch, "CLEARLY", -np.inf)  # these fixes do not jump
     found = _batch.solve_batch(problem)
     assert seen == noisier == []
     for of in (found.problem, found.stated):

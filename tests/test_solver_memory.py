@@ -19,7 +19,7 @@ from graphloc.build import Problem, make_problem
 from graphloc.eval.calibrate import PROBE
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
-from graphloc.solve import smooth
+from graphloc.solve import _final_passes, smooth
 from graphloc.solve._batch import BatchResult, solve_batch
 from graphloc.solve._memory import give_back_memory
 from graphloc.solve._offsets import offsets_of
@@ -117,3 +117,24 @@ def test_tree_and_graph_are_gone_before_memory_is_given_back_and_offsets_are_ask
     smooth(run.recording, run.config, problem.datum, rows=SENSORS, inertial=INERTIAL, probe=PROBE)
     assert len(held) == 2
     assert said == ["given back: 0 held", "asked: 0 held"]
+
+
+def test_a_graph_is_gone_before_the_next_is_made_where_sensors_scatter(
+    problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a run of hours two of them are gigabytes more."""
+    held: list[weakref.ref[Any]] = []
+    final_passes, rounds = _final_passes._final_passes, [{"gnss": {"sigma_scale": 1.5}}, {}]  # noqa: SLF001
+
+    def passes(*arguments: Any) -> Any:
+        assert all(ref() is None for ref in held)
+        settled = final_passes(*arguments)
+        held.append(weakref.ref(settled.graph))
+        return settled
+
+    monkeypatch.setattr(_final_passes, "_final_passes", passes)
+    monkeypatch.setattr(_final_passes, "scattering", lambda *_, **__: rounds.pop(0))
+    found = solve_batch(problem)
+    assert rounds == []
+    assert len(held) == 2
+    assert found.problem.config.sensors["gnss"].sigma_scale == 1.5 * problem.config.sensors["gnss"].sigma_scale

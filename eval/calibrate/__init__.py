@@ -128,9 +128,28 @@ def _suggestion(
     config: VesselConfig,
     taken_s: float | None = None,
 ) -> Suggestion:
-    """`taken_s`: what the track has taken of a delay, where it is estimated."""
+    """Return what an offset that the run shows suggests.
+
+    Args:
+        others: offsets that explain the run as well, which it cannot tell from this one.
+        taken_s: what the track has taken of a delay, where it is estimated.
+    """
     key, configured = _configured(name, recording, config)
     unit, factor = _UNIT[name[1]]
+    action = _action(name, found, recording, config, taken_s)
+    if others:
+        either = "; or ".join(_instead(n, e, recording, config) for n, e in others.items())
+        action += f"; this run cannot tell it from {either}"
+    return Suggestion(
+        sensor=name[0], key=key, unit=unit, configured=configured, suggested=configured + factor * found.value,
+        sigma=factor * found.sigma, z=found.z, evidence=_MEANS[name[1]], action=action,
+    )  # fmt: skip
+
+
+def _action(
+    name: Name, found: OffsetEstimate, recording: Recording, config: VesselConfig, taken_s: float | None
+) -> str:
+    """Return what to do about an offset, and what else may be the cause; arguments as of `_suggestion`."""
     action = "measure it, then set it"
     block = config.sensors[name[0]]
     if (
@@ -158,13 +177,7 @@ def _suggestion(
         action += (
             f"; or it is the IMU that sits elsewhere, the other way: measure sensors.{imu}.mount.xyz_m, too, which is 0"
         )
-    if others:
-        either = "; or ".join(_instead(n, e, recording, config) for n, e in others.items())
-        action += f"; this run cannot tell it from {either}"
-    return Suggestion(
-        sensor=name[0], key=key, unit=unit, configured=configured, suggested=configured + factor * found.value,
-        sigma=factor * found.sigma, z=found.z, evidence=_MEANS[name[1]], action=action,
-    )  # fmt: skip
+    return action
 
 
 def _instead(name: Name, found: OffsetEstimate, recording: Recording, config: VesselConfig) -> str:

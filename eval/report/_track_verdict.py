@@ -92,15 +92,15 @@ def track_verdict(data: ReportData, solution: Solution) -> TrackVerdict:
         solution: one of `data.solutions`.
     """
     reasons = (
-        *_bounds(data, solution), *_far_from_fixes(data, solution), *_late(data, solution), *_levers(data, solution),
-        *_origins(data, solution), *_beside(data, solution), *_from_offline(data, solution), *_compared(data, solution),
-        *_solved(data, solution),
+        *_bounds(solution), *_coverage(data, solution), *_heading_coverage(data, solution),
+        *_far_from_fixes(data, solution), *_late(data, solution), *_levers(data, solution), *_origins(data, solution),
+        *_beside(data, solution), *_from_offline(data, solution), *_compared(data, solution), *_solved(data, solution),
     )  # fmt: skip
     return TrackVerdict(name=solution.name, accuracy=_accuracy(data, solution.name), reasons=reasons)
 
 
-def _bounds(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Yield the size of the 95 % bounds, the health, and the coverage of the truth."""
+def _bounds(solution: Solution) -> Iterator[Reason]:
+    """Yield the size of the 95 % bounds, and the health."""
     assert solution.trajectory.cov is not None
     bound = float(np.percentile(bounds_95(solution.trajectory.cov)[:, 0], 95))
     called = shares(solution)
@@ -109,29 +109,38 @@ def _bounds(data: ReportData, solution: Solution) -> Iterator[Reason]:
         trust=Trust.WITH_CARE if doubtful else Trust.YES,
         text=f"Its 95 % bound is {bound:.2f} m or less for 95 % of the run. Health: {said_of(solution)}.",
     )
-    covered, headed, nees = (
-        of(data, solution.name, column) for column in ("coverage_95", "heading_coverage_95", "nees")
+
+
+def _coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """Yield how often the bounds of the position held the truth."""
+    covered, nees = (of(data, solution.name, column) for column in ("coverage_95", "nees"))
+    if covered is None:
+        return
+    trust, why = Trust.YES, ""
+    if covered < _NOT_COVERED:
+        trust, why = Trust.NO, ". The bounds are far too small: a mount, the datum or a noise is wrong"
+    elif covered < _COVERED or (nees is not None and nees > _TOO_SURE):
+        trust, why = Trust.WITH_CARE, "; they are too small"
+    beside = "" if nees is None else f" (NEES {nees:.1f}; 2 where they are honest)"
+    yield Reason(trust=trust, text=f"Its 95 % bounds held the truth for {percent(covered)} of the time{beside}{why}.")
+
+
+def _heading_coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """Yield how often the bounds of the heading held the truth."""
+    headed = of(data, solution.name, "heading_coverage_95")
+    if headed is None:
+        return
+    assert solution.trajectory.cov is not None
+    bound_deg = float(np.median(bounds_95(solution.trajectory.cov)[:, 2]))
+    off_deg, most_deg = (of(data, solution.name, f"heading_{which}_deg") for which in ("rmse", "max"))
+    off = "" if off_deg is None or most_deg is None else f"; off by {off_deg:.2f} deg (RMS), {most_deg:.2f} at most"
+    trust, why = Trust.YES, ""
+    if headed < _COVERED:
+        trust, why = Trust.WITH_CARE, "; too small, or in a run of a minute or two chance"
+    text = (
+        f"Its heading bounds ({bound_deg:.2f} deg, median) held the truth for {percent(headed)} of the time{off}{why}."
     )
-    if covered is not None:
-        too_sure = nees is not None and nees > _TOO_SURE
-        trust = Trust.NO if covered < _NOT_COVERED else Trust.WITH_CARE if covered < _COVERED or too_sure else Trust.YES
-        why = ". The bounds are far too small: a mount, the datum or a noise is wrong" if trust is Trust.NO else ""
-        why = why or ("; they are too small" if trust is Trust.WITH_CARE else "")
-        beside = "" if nees is None else f" (NEES {nees:.1f}; 2 where they are honest)"
-        yield Reason(
-            trust=trust, text=f"Its 95 % bounds held the truth for {percent(covered)} of the time{beside}{why}."
-        )
-    if headed is not None:
-        bound_deg = float(np.median(bounds_95(solution.trajectory.cov)[:, 2]))
-        off_deg, most_deg = (of(data, solution.name, f"heading_{which}_deg") for which in ("rmse", "max"))
-        off = "" if off_deg is None or most_deg is None else f"; off by {off_deg:.2f} deg (RMS), {most_deg:.2f} at most"
-        trust, why = (
-            (Trust.WITH_CARE, "; too small, or in a run of a minute or two chance")
-            if headed < _COVERED
-            else (Trust.YES, "")
-        )
-        text = f"Its heading bounds ({bound_deg:.2f} deg, median) held the truth for {percent(headed)} of the time{off}{why}."
-        yield Reason(trust=trust, text=text)
+    yield Reason(trust=trust, text=text)
 
 
 def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
@@ -223,36 +232,40 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
     if data.recording.truth is not None or track.cov is None:
         return
     bound_m = float(np.median(bounds_95(track.cov)[:, 0]))
-    suggestions, checks = (data.calibration.suggestions, data.calibration.checks) if data.calibration else ((), ())
     for name, block in data.config.of_kind("gnss").items():
         first = data.config.receiver_of(name)
         if name != first and block.mount == data.config.sensors[first].mount:
             continue  # the same antenna
-        if block.mount_sigma_m > 0.0:  # it is estimated, and in the bounds
-            if solution.stats.online:
-                yield Reason(
-                    trust=Trust.WITH_CARE,
-                    text=f"Where the antenna of {name} sits is estimated (mount_sigma_m): while the vessel has hardly turned, the bounds of the "
-                    "online track are too small for that. Measured, they are right.",
-                )
-            continue
-        keys = [f"sensors.{name}.mount.xyz_m[{axis}]" for axis in (0, 1)]
-        off_m = math.hypot(*(s.suggested - s.configured for s in suggestions if s.key in keys))
-        if off_m > 0.0:
+        if block.mount_sigma_m == 0.0:
+            yield from _lever(data, name, bound_m)
+        elif solution.stats.online:  # it is estimated; offline it is in the bounds
             yield Reason(
-                trust=Trust.WITH_CARE if off_m > bound_m else Trust.YES,
-                text=f"The antenna of {name} looks {off_m:.2f} m away from where mount.xyz_m has it, or the IMU does (Calibration, below): "
-                f"the track is off by up to as much, which its bounds of {bound_m:.2f} m (median) do not include.",
+                trust=Trust.WITH_CARE,
+                text=f"Where the antenna of {name} sits is estimated (mount_sigma_m): while the vessel has hardly turned, the bounds of the "
+                "online track are too small for that. Measured, they are right.",
             )
-        elif name not in data.recording.mounts and not any(block.mount.xyz_m[:2]):
-            known = [SIGMAS_95 * c.sigma for c in checks if c.key in keys]
-            known_m = math.hypot(*known) if len(known) == len(keys) else None
-            said = "nothing here checks that" if known_m is None else f"this run knows it to {known_m:.2g} m (95 %)"
-            yield Reason(
-                trust=Trust.YES if known_m is not None and known_m < bound_m else Trust.WITH_CARE,
-                text=f"The antenna of {name} is taken to be at the vessel's origin (mount.xyz_m is 0, as `inspect` drafts it); where it is "
-                f"not, the track is off by as much, which no bound includes; {said}.",
-            )
+
+
+def _lever(data: ReportData, name: str, bound_m: float) -> Iterator[Reason]:
+    """Yield an antenna whose place is taken as configured, if that looks wrong or is the default; `bound_m`: of the position, 95 %, median."""
+    suggestions, checks = (data.calibration.suggestions, data.calibration.checks) if data.calibration else ((), ())
+    keys = [f"sensors.{name}.mount.xyz_m[{axis}]" for axis in (0, 1)]
+    off_m = math.hypot(*(s.suggested - s.configured for s in suggestions if s.key in keys))
+    if off_m > 0.0:
+        yield Reason(
+            trust=Trust.WITH_CARE if off_m > bound_m else Trust.YES,
+            text=f"The antenna of {name} looks {off_m:.2f} m away from where mount.xyz_m has it, or the IMU does (Calibration, below): "
+            f"the track is off by up to as much, which its bounds of {bound_m:.2f} m (median) do not include.",
+        )
+    elif name not in data.recording.mounts and not any(data.config.sensors[name].mount.xyz_m[:2]):
+        known = [SIGMAS_95 * c.sigma for c in checks if c.key in keys]
+        known_m = math.hypot(*known) if len(known) == len(keys) else None
+        said = "nothing here checks that" if known_m is None else f"this run knows it to {known_m:.2g} m (95 %)"
+        yield Reason(
+            trust=Trust.YES if known_m is not None and known_m < bound_m else Trust.WITH_CARE,
+            text=f"The antenna of {name} is taken to be at the vessel's origin (mount.xyz_m is 0, as `inspect` drafts it); where it is "
+            f"not, the track is off by as much, which no bound includes; {said}.",
+        )
 
 
 def _origins(data: ReportData, solution: Solution) -> Iterator[Reason]:

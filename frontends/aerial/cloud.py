@@ -218,30 +218,20 @@ def level(
     names = ", ".join(dict.fromkeys(c.lidar for c in ([clouds[k] for k in newest] or clouds))) or "no LiDAR"
     if not track.covers(np.array([at_ns])).all():
         raise InputError(f"the track does not cover the scan of {names}: {_outside(track, at_ns)}")
-    kept = [_during(c, track) for c in (*clouds, *(c for turn in others for c in turn))]
-    bins, rows = _shared_bins([*(c.stamps_ns // _BIN_NS for c in kept), np.array([at_ns // _BIN_NS])])
-    times = np.clip(bins * _BIN_NS + _BIN_NS // 2, track.stamps_ns[0], track.stamps_ns[-1])
-    covered = track.covers(times)
-    covered[rows[-1]] = True
-    if not covered.all():  # a gap of the track
-        kept = [c.where(covered[r]) for c, r in zip(kept, rows[:-1], strict=True)]
-        renumbered = np.cumsum(covered) - 1
-        rows = [renumbered[r[covered[r]]] for r in rows]
-        times = times[covered]
+    kept, times, rows, here = _covered([*clouds, *(c for turn in others for c in turn)], track, at_ns)
     had = [clouds[k].stamps_ns for k in newest if len(clouds[k].stamps_ns)]
     if had and not any(len(kept[k].stamps_ns) for k in newest):
         raise InputError(
             f"the track does not cover the scan of {names}: {_outside(track, int(np.median(np.concatenate(had))))}"
         )
     poses = track.at(times)
-    here = int(rows[-1][0])
     yaw = float(poses.yaw_rad[here])
     c, s = np.cos(yaw), np.sin(yaw)
     to_level = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     up = poses.p_world_m[here] + np.array([0.0, 0.0, waterline_m])
-    points, origins = np.empty((sum(len(r) for r in rows[:-1]), 3)), []
+    points, origins = np.empty((sum(len(r) for r in rows), 3)), []
     begin = 0
-    for cloud, row in zip(kept, rows[:-1], strict=True):
+    for cloud, row in zip(kept, rows, strict=True):
         t, R = mounts[cloud.lidar]
         origin = (poses.p_world_m + poses.R_world_body @ t - up) @ to_level.T
         _move(cloud.points_m, to_level @ poses.R_world_body @ R, origin, row, points[begin : begin + len(row)])
@@ -253,6 +243,27 @@ def level(
         now=sum(len(c.stamps_ns) for c in kept[: len(clouds)]),
         turns=1 + len(others),
     )
+
+
+def _covered(
+    clouds: Sequence[Cloud], track: Trajectory, at_ns: int
+) -> tuple[list[Cloud], NDArray[np.int64], list[NDArray[np.int64]], int]:
+    """Return the points that a track covers, and when they were seen, to 2 ms.
+
+    Returns:
+        The clouds without other points; the times (T,), ns; for each cloud which of these are its points'; and which is `at_ns`.
+    """
+    kept = [_during(c, track) for c in clouds]
+    bins, rows = _shared_bins([*(c.stamps_ns // _BIN_NS for c in kept), np.array([at_ns // _BIN_NS])])
+    times = np.clip(bins * _BIN_NS + _BIN_NS // 2, track.stamps_ns[0], track.stamps_ns[-1])
+    covered = track.covers(times)
+    covered[rows[-1]] = True
+    if not covered.all():  # a gap of the track
+        kept = [c.where(covered[r]) for c, r in zip(kept, rows[:-1], strict=True)]
+        renumbered = np.cumsum(covered) - 1
+        rows = [renumbered[r[covered[r]]] for r in rows]
+        times = times[covered]
+    return kept, times, rows[:-1], int(rows[-1][0])
 
 
 def _move(points: Array, R: Array, t: Array, row: NDArray[np.int64], out: Array) -> None:

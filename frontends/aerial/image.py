@@ -75,41 +75,12 @@ class AerialImage:
 
     def __init__(self, path: Path, datum: Datum) -> None:
         self._path, self._datum = path, datum
-        try:
-            folder = path.is_dir()
-        except OSError as error:  # such as no permission, a name that is too long
-            raise InputError(f"{path}: {error.strerror}") from None
-        name = describe_tiles(path, datum) if folder else path
-        # Cut at the bounds that it states, an MBTiles is off by half a pixel (seen with GDAL 3.10: 5 cm of 16).
-        options = {"USE_BOUNDS": "NO"} if path.suffix.lower() == ".mbtiles" else {}
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # said below, as an error
-                self._source: Any = rasterio.open(name, **options)
-        except rasterio.errors.RasterioError as error:
-            raise InputError(f"{path}: not an image that GDAL can read ({_line(error)})") from None
-        source = self._source
+        self._source = source = _opened(path, datum)
         wkt = source.crs.to_wkt() if source.crs is not None else _beside(path)
         why_not = _why_not(source, path, has_crs=bool(wkt))
         if why_not:
             raise InputError(f"{path}: {why_not}")
-        lon, lat = datum.origin.longitude_deg, datum.origin.latitude_deg
-        lon -= 360.0 if lon > 180.0 else 0.0  # a datum may say 190 deg, PROJ's areas may not
-        try:
-            crs = CRS.from_wkt(wkt)
-            here = AreaOfInterest(lon, lat, lon, lat)  # which tie to WGS 84 is best depends on where
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # that a better tie needs a grid: said below
-                ties = TransformerGroup(4326, crs, always_xy=True, area_of_interest=here).transformers
-        except ProjError as error:
-            raise InputError(f"{path}: its CRS cannot be used ({_line(error)})") from None
-        if not ties:
-            raise InputError(
-                f"{path}: its CRS ({crs.name}) is tied to no place on Earth: gdal_translate -a_srs EPSG:<code>"
-            )
-        self._to_image = ties[0]
-        if self._to_image.accuracy > _LOOSE_M:
-            log.warning("%s: its CRS (%s) is tied to WGS 84 to %g m only", path, crs.name, self._to_image.accuracy)
+        self._to_image = _tie(path, wkt, datum)
         bands = {c: k for k, c in zip(source.indexes, source.colorinterp, strict=True)}
         named = [bands.get(c, 0) for c in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
         self._bands = named if all(named) else [1, 2, 3] if source.count >= 3 else [1]
@@ -227,6 +198,52 @@ class AerialImage:
         values = np.concatenate(found)
         darkest, brightest = np.percentile(values, [2.0, 98.0]) if len(values) else (0.0, 1.0)
         return float(darkest), float(max(brightest, darkest + 1e-9))
+
+
+def _opened(path: Path, datum: Datum) -> Any:
+    """Return what GDAL reads of an image file, or of a folder of tiles.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        folder = path.is_dir()
+    except OSError as error:  # such as no permission, a name that is too long
+        raise InputError(f"{path}: {error.strerror}") from None
+    name = describe_tiles(path, datum) if folder else path
+    # Cut at the bounds that it states, an MBTiles is off by half a pixel (seen with GDAL 3.10: 5 cm of 16).
+    options = {"USE_BOUNDS": "NO"} if path.suffix.lower() == ".mbtiles" else {}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # said by `_why_not`, as an error
+            return rasterio.open(name, **options)
+    except rasterio.errors.RasterioError as error:
+        raise InputError(f"{path}: not an image that GDAL can read ({_line(error)})") from None
+
+
+def _tie(path: Path, wkt: str, datum: Datum) -> Any:
+    """Return the transformation from longitude and latitude (WGS 84) to the CRS of an image, the best one near the datum.
+
+    Raises:
+        InputError: there is none.
+    """
+    lon, lat = datum.origin.longitude_deg, datum.origin.latitude_deg
+    lon -= 360.0 if lon > 180.0 else 0.0  # a datum may say 190 deg, PROJ's areas may not
+    try:
+        crs = CRS.from_wkt(wkt)
+        here = AreaOfInterest(lon, lat, lon, lat)  # which tie to WGS 84 is best depends on where
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that a better tie needs a grid: said below
+            ties = TransformerGroup(4326, crs, always_xy=True, area_of_interest=here).transformers
+    except ProjError as error:
+        raise InputError(f"{path}: its CRS cannot be used ({_line(error)})") from None
+    if not ties:
+        raise InputError(
+            f"{path}: its CRS ({crs.name}) is tied to no place on Earth: gdal_translate -a_srs EPSG:<code>"
+        )
+    if ties[0].accuracy > _LOOSE_M:
+        log.warning("%s: its CRS (%s) is tied to WGS 84 to %g m only", path, crs.name, ties[0].accuracy)
+    return ties[0]
 
 
 def _palette_of(source: Any) -> Pixels:

@@ -119,9 +119,6 @@ def _mirrored(R: Array, t: Array) -> Array:
 def _descended(arms_m, rays, whiten, R, there):  # type: ignore[no-untyped-def]
     """Levenberg-Marquardt: move R (3, 3) and the middle in camera, there (3,), to a minimum, in place.
 
-    The error of a point is that of its ray. With its arm from the middle, (x, y, z) in camera, and its ray (u, v) at some depth, a shift
-    and a rotation about the middle change it by d u = (1, 0, -u) / depth (shift + turn x arm), and so for v.
-
     Loops are written out, as numba takes seconds to compile what numpy would do for them.
 
     Args:
@@ -136,43 +133,12 @@ def _descended(arms_m, rays, whiten, R, there):  # type: ignore[no-untyped-def]
     R_new, there_new = R.copy(), there.copy()
     squared, damping, settled = np.inf, 1e-3, False
     for round_ in range(_ROUNDS + 1):
-        # Errors at the new pose, in the last column, and their derivatives.
-        ahead = True
-        for n in range(len(arms_m)):
-            x, y, z = 0.0, 0.0, 0.0
-            for k in range(3):
-                x += R_new[0, k] * arms_m[n, k]
-                y += R_new[1, k] * arms_m[n, k]
-                z += R_new[2, k] * arms_m[n, k]
-            depth = z + there_new[2]
-            ahead = ahead and not depth < _NEAREST_M
-            u, v = (x + there_new[0]) / depth, (y + there_new[1]) / depth
-            i, j = 2 * n, 2 * n + 1
-            raw[i, 0], raw[i, 1], raw[i, 2] = 1.0 / depth, 0.0, -u / depth
-            raw[j, 0], raw[j, 1], raw[j, 2] = 0.0, 1.0 / depth, -v / depth
-            raw[i, 3], raw[i, 4], raw[i, 5], raw[i, 6] = -u * y / depth, (z + u * x) / depth, -y / depth, u - rays[n, 0]
-            raw[j, 3], raw[j, 4], raw[j, 5], raw[j, 6] = (-z - v * y) / depth, v * x / depth, x / depth, v - rays[n, 1]
+        ahead = _linearised(arms_m, rays, R_new, there_new, raw)
         if not ahead and round_ == 0:
             return -1.0, A
-        after = 0.0
-        for i in range(size):
-            r[i] = 0.0
-            for k in range(size):
-                r[i] += whiten[i, k] * raw[k, 6]
-            after += r[i] * r[i]
+        after = _squared(whiten, raw, r)
         if round_ == 0 or (ahead and after <= squared):
-            for i in range(size):
-                for k in range(6):
-                    J[i, k] = 0.0
-                for m in range(size):
-                    for k in range(6):
-                        J[i, k] += whiten[i, m] * raw[m, k]
-                J[i, 6] = r[i]
-            for i in range(6):
-                for k in range(6):
-                    A[i, k] = 0.0
-                    for m in range(size):
-                        A[i, k] += J[m, i] * J[m, k]
+            _normal_equations(whiten, raw, r, J, A)
             for i in range(3):
                 there[i] = there_new[i]
                 for k in range(3):
@@ -187,50 +153,102 @@ def _descended(arms_m, rays, whiten, R, there):  # type: ignore[no-untyped-def]
             damping *= 8.0
         if settled or round_ == _ROUNDS or damping > 1e9:
             break
-        # Damped step by Cholesky; not numbers, which are no progress, where A is not positive.
-        for i in range(6):
-            for j in range(i + 1):
-                value = A[i, j] + (damping * A[i, j] + 1e-9 if i == j else 0.0)
-                for k in range(j):
-                    value -= L[i, k] * L[j, k]
-                L[i, j] = math.sqrt(value) if i == j else value / L[j, j]
-        for i in range(6):
-            value = 0.0
-            for m in range(size):
-                value -= J[m, i] * J[m, 6]
-            for k in range(i):
-                value -= L[i, k] * step[k]
-            step[i] = value / L[i, i]
-        for i in range(5, -1, -1):
-            value = step[i]
-            for k in range(i + 1, 6):
-                value -= L[k, i] * step[k]
-            step[i] = value / L[i, i]
-        # Its rotation, by Rodrigues' formula.
-        a, b, c = step[3], step[4], step[5]
-        angle = math.sqrt(a * a + b * b + c * c)
-        sine = math.sin(angle) / angle if angle > 0.0 else 1.0
-        rest = (1.0 - math.cos(angle)) / (angle * angle) if angle > 0.0 else 0.5
-        turn[0, 0], turn[0, 1], turn[0, 2] = (
-            1.0 - rest * (b * b + c * c),
-            rest * a * b - sine * c,
-            rest * a * c + sine * b,
-        )
-        turn[1, 0], turn[1, 1], turn[1, 2] = (
-            rest * a * b + sine * c,
-            1.0 - rest * (a * a + c * c),
-            rest * b * c - sine * a,
-        )
-        turn[2, 0], turn[2, 1], turn[2, 2] = (
-            rest * a * c - sine * b,
-            rest * b * c + sine * a,
-            1.0 - rest * (a * a + b * b),
-        )
+        _damped_step(A, J, damping, L, step)
+        _rotation(step[3], step[4], step[5], turn)
         for i in range(3):
             there_new[i] = there[i] + step[i]
             for k in range(3):
                 R_new[i, k] = turn[i, 0] * R[0, k] + turn[i, 1] * R[1, k] + turn[i, 2] * R[2, k]
     return squared, A
+
+
+@compiled
+def _linearised(arms_m, rays, R, there, raw):  # type: ignore[no-untyped-def]
+    """Fill in the derivatives of the rays at a pose, and their errors in the last column of raw (8 K, 7); return whether all are ahead.
+
+    With its arm from the middle, (x, y, z) in camera, and its ray (u, v) at some depth, a shift and a rotation about the middle change
+    that of a point by d u = (1, 0, -u) / depth (shift + turn x arm), and so for v.
+    """
+    ahead = True
+    for n in range(len(arms_m)):
+        x, y, z = 0.0, 0.0, 0.0
+        for k in range(3):
+            x += R[0, k] * arms_m[n, k]
+            y += R[1, k] * arms_m[n, k]
+            z += R[2, k] * arms_m[n, k]
+        depth = z + there[2]
+        ahead = ahead and not depth < _NEAREST_M
+        u, v = (x + there[0]) / depth, (y + there[1]) / depth
+        i, j = 2 * n, 2 * n + 1
+        raw[i, 0], raw[i, 1], raw[i, 2] = 1.0 / depth, 0.0, -u / depth
+        raw[j, 0], raw[j, 1], raw[j, 2] = 0.0, 1.0 / depth, -v / depth
+        raw[i, 3], raw[i, 4], raw[i, 5], raw[i, 6] = -u * y / depth, (z + u * x) / depth, -y / depth, u - rays[n, 0]
+        raw[j, 3], raw[j, 4], raw[j, 5], raw[j, 6] = (-z - v * y) / depth, v * x / depth, x / depth, v - rays[n, 1]
+    return ahead
+
+
+@compiled
+def _squared(whiten, raw, r):  # type: ignore[no-untyped-def]
+    """Fill in the whitened errors (8 K,), and return the sum of their squares."""
+    total = 0.0
+    for i in range(len(whiten)):
+        r[i] = 0.0
+        for k in range(len(whiten)):
+            r[i] += whiten[i, k] * raw[k, 6]
+        total += r[i] * r[i]
+    return total
+
+
+@compiled
+def _normal_equations(whiten, raw, r, J, A):  # type: ignore[no-untyped-def]
+    """Fill in the whitened derivatives, with the errors in the last column of J (8 K, 7), and the information A (6, 6)."""
+    size = len(whiten)
+    for i in range(size):
+        for k in range(6):
+            J[i, k] = 0.0
+        for m in range(size):
+            for k in range(6):
+                J[i, k] += whiten[i, m] * raw[m, k]
+        J[i, 6] = r[i]
+    for i in range(6):
+        for k in range(6):
+            A[i, k] = 0.0
+            for m in range(size):
+                A[i, k] += J[m, i] * J[m, k]
+
+
+@compiled
+def _damped_step(A, J, damping, L, step):  # type: ignore[no-untyped-def]
+    """Fill in the damped step (6,), by Cholesky; not numbers, which are no progress, where A is not positive."""
+    for i in range(6):
+        for j in range(i + 1):
+            value = A[i, j] + (damping * A[i, j] + 1e-9 if i == j else 0.0)
+            for k in range(j):
+                value -= L[i, k] * L[j, k]
+            L[i, j] = math.sqrt(value) if i == j else value / L[j, j]
+    for i in range(6):
+        value = 0.0
+        for m in range(len(J)):
+            value -= J[m, i] * J[m, 6]
+        for k in range(i):
+            value -= L[i, k] * step[k]
+        step[i] = value / L[i, i]
+    for i in range(5, -1, -1):
+        value = step[i]
+        for k in range(i + 1, 6):
+            value -= L[k, i] * step[k]
+        step[i] = value / L[i, i]
+
+
+@compiled
+def _rotation(a, b, c, turn):  # type: ignore[no-untyped-def]
+    """Fill in the rotation (3, 3) by a vector (a, b, c), rad: Rodrigues' formula."""
+    angle = math.sqrt(a * a + b * b + c * c)
+    sine = math.sin(angle) / angle if angle > 0.0 else 1.0
+    rest = (1.0 - math.cos(angle)) / (angle * angle) if angle > 0.0 else 0.5
+    turn[0, 0], turn[0, 1], turn[0, 2] = 1.0 - rest * (b * b + c * c), rest * a * b - sine * c, rest * a * c + sine * b
+    turn[1, 0], turn[1, 1], turn[1, 2] = rest * a * b + sine * c, 1.0 - rest * (a * a + c * c), rest * b * c - sine * a
+    turn[2, 0], turn[2, 1], turn[2, 2] = rest * a * c - sine * b, rest * b * c + sine * a, 1.0 - rest * (a * a + b * b)
 
 
 def _misfit(points_m: Array, rays: Array, whiten: Array, R: Array, t: Array) -> float:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
@@ -151,22 +151,34 @@ def build_graph(
     for stream in problem.streams:
         if stream.slow is not None:
             _add_slow_chain(graph, problem, stream, stream.slow, values, nodes, prior, jumps)
-        for i in stream.between(first, last):
-            decided = decisions.get((stream.number, i))
-            if decided is None:
-                continue
-            at = decided.at
-            if at.slow_next is not None and not guess.exists(at.slow_next[0]):  # it lies beyond the stretch
-                decided = Decided(decided.decision, replace(at, slow_next=None))
-            update = decided.update(stream, i)
-            if made is not None:
-                made[(stream.number, i)] = range(graph.size(), graph.size() + len(update.factors))
-            for factor in update.factors:
-                graph.add(factor)
-            for key, value in update.guesses:
-                guess.insert(key, value)
+        _add_measurements(graph, guess, stream, stream.between(first, last), decisions, made)
         _add_constants(graph, guess, stream, values, prior)
     return graph, guess
+
+
+def _add_measurements(
+    graph: gtsam.NonlinearFactorGraph,
+    guess: gtsam.Values,
+    stream: Stream,
+    indices: Iterable[int],
+    decisions: Decisions,
+    made: Made | None,
+) -> None:
+    """Add the factors of measurements of a stream, and the values of their leaves."""
+    for i in indices:
+        decided = decisions.get((stream.number, i))
+        if decided is None:
+            continue
+        at = decided.at
+        if at.slow_next is not None and not guess.exists(at.slow_next[0]):  # it lies beyond the stretch
+            decided = Decided(decided.decision, replace(at, slow_next=None))
+        update = decided.update(stream, i)
+        if made is not None:
+            made[(stream.number, i)] = range(graph.size(), graph.size() + len(update.factors))
+        for factor in update.factors:
+            graph.add(factor)
+        for key, value in update.guesses:
+            guess.insert(key, value)
 
 
 def nodes_of(problem: Problem, first: int, last: int) -> range:

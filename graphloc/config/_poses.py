@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import shapely
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from graphloc.blocks import Block, Finite, MountConfig, NonNegative, Positive
 from graphloc.config._sensor import KernelConfig, SensorConfig
@@ -67,6 +67,13 @@ class PoseSlowErrorConfig(Block):
     """The same for yaw, deg."""
     time_constant_s: Positive = 60.0
     """Correlation time, s."""
+
+    @model_validator(mode="after")
+    def _of_some_size(self) -> PoseSlowErrorConfig:
+        usual = type(self).model_fields["time_constant_s"].default  # which an effective configuration states, too
+        if self.time_constant_s != usual and self.sigma_m == self.sigma_deg == 0.0:
+            raise ValueError("time_constant_s is of no error: set sigma_m or sigma_deg, too, or delete it")
+        return self
 
 
 class PoseConfig(AnyPoseConfig):

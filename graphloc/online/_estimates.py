@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from graphloc.estimate import Estimate
+from graphloc.frames import Array
 from graphloc.online._anchor import sound
 from graphloc.online._lag import Lag
 from graphloc.online._odometry import Odometry
@@ -51,12 +52,7 @@ def estimate_of(
     at_ns, lever = now.stamp_ns, -problem.t_body_imu_m
     R = now.pose.rotation().matrix()
     gyro = problem.links.gyro_at(np.array([at_ns]))[0] - problem.R_body_imu @ newest.bias.gyroscope()
-    cov = world_covariance(sound(now.pose_cov), R, lever)
-    cov[:3, :3] += unmodelled_covariance(list(problem.streams.values()))
-    v_cov = now.velocity_cov
-    if unmodelled is not None:
-        cov += unmodelled.pose(R @ lever)
-        v_cov = v_cov + unmodelled.velocity
+    cov, v_cov = _covariances(now, lag, R, unmodelled)
     others_m, others_cov = lag.others
     cov[:3, :3] += others_cov
     cov[5, 5] += heading_off_rad**2
@@ -85,3 +81,18 @@ def estimate_of(
         reason=reason,
         since_agreed_s=since,
     )
+
+
+def _covariances(now: Propagated, lag: Lag, R: Array, unmodelled: UnmodelledError | None) -> tuple[Array, Array]:
+    """Return those of the pose of the body's origin (6, 6) and of the velocity (3, 3), axes of world, with what is left out of the window.
+
+    Args:
+        R: (3, 3) attitude. unmodelled: as of `estimate_of`.
+    """
+    lever, streams = -lag.problem.t_body_imu_m, list(lag.problem.streams.values())
+    cov, v_cov = world_covariance(sound(now.pose_cov), R, lever), now.velocity_cov
+    cov[:3, :3] += unmodelled_covariance(streams)
+    if unmodelled is not None:
+        cov += unmodelled.pose(R @ lever)
+        v_cov = v_cov + unmodelled.velocity
+    return cov, v_cov

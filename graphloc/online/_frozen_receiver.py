@@ -56,12 +56,7 @@ class FrozenReceiverDetector:
         """
         if self._seen and at_s <= self._seen[-1][0]:
             return
-        still_m = max(_STANDS_M, _SIGMAS * float(np.sqrt(2.0)) * sigma_m)  # of the difference of two positions
-        if self._stands_m is None or float(np.linalg.norm(told_m - self._stands_m)) > still_m:
-            self.stands_s, self._stands_m = at_s, np.array(told_m)
-        self._seen.append((at_s, np.array(told_m), np.array(told_m - estimated_m)))
-        while at_s - self._seen[0][0] > 1.25 * WINDOW_S:
-            self._seen.popleft()
+        self._take(at_s, told_m, estimated_m, sigma_m)
         t = np.array([s for s, _, _ in self._seen])
         if len(t) < _FEWEST or t[-1] - t[0] < WINDOW_S:
             return
@@ -71,8 +66,9 @@ class FrozenReceiverDetector:
         rms, speed = float(np.sqrt((left**2).sum(axis=1).mean())), float(np.linalg.norm(growth))
         late = t > t[-1] - (0.5 if self.frozen else 1.0) * WINDOW_S  # shorter when frozen, so that motion is seen soon
         moves, noise = _slope(t[late], told[late])
-        stands = float(np.linalg.norm(moves)) < _STANDS_MPS + _SIGMAS * sigma_m * noise
-        least = max(_LEAST_MPS, _SHARE * float(np.linalg.norm(v_mps)))
+        moves_mps, of_vessel_mps = float(np.linalg.norm(moves)), _SHARE * float(np.linalg.norm(v_mps))
+        stands = moves_mps < _STANDS_MPS + _SIGMAS * sigma_m * noise
+        least = max(_LEAST_MPS, of_vessel_mps)
         if self.frozen:  # the growing uncertainty of the velocity without it is no evidence that it moves
             self.frozen = stands and speed > 0.5 * least
             return
@@ -81,11 +77,20 @@ class FrozenReceiverDetector:
             self._along_s = at_s
         along = self._along_s is not None and at_s - self._along_s > _ALONG_S
         # Few or noisy fixes do not show whether it stands: it may as well move as the vessel does.
-        stands &= float(np.linalg.norm(moves)) < max(_STANDS_MPS, _SHARE * float(np.linalg.norm(v_mps)))
+        stands &= moves_mps < max(_STANDS_MPS, of_vessel_mps)
         self.frozen = along and stands and speed > least and rms < _LINE * speed * float(t[-1] - t[0])
         if self.frozen:  # without its fixes the estimate changes
             self._frozen_s = at_s
             self._seen.clear()
+
+    def _take(self, at_s: float, told_m: Array, estimated_m: Array, sigma_m: float) -> None:
+        """Take in a fix and its error (arguments as of `note`), and forget those before the window."""
+        still_m = max(_STANDS_M, _SIGMAS * float(np.sqrt(2.0)) * sigma_m)  # of the difference of two positions
+        if self._stands_m is None or float(np.linalg.norm(told_m - self._stands_m)) > still_m:
+            self.stands_s, self._stands_m = at_s, np.array(told_m)
+        self._seen.append((at_s, np.array(told_m), np.array(told_m - estimated_m)))
+        while at_s - self._seen[0][0] > 1.25 * WINDOW_S:
+            self._seen.popleft()
 
 
 def _slope(t: Array, places_m: Array) -> tuple[Array, float]:

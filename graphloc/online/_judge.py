@@ -189,12 +189,7 @@ class Judge:
             if not entry.judged or verdict.weight >= AGREES:
                 self._agreement.note(stream, entry.measurement, verdict)
             if not entry.judged:
-                agrees, stamp_ns = verdict.weight >= AGREES, entry.measurement.stamp_ns
-                self.denials.note(stream.name, stamp_ns, 0.0, agrees=agrees, outlier=True)
-            if not entry.judged and verdict.weight < AGREES:
-                self._refuted.add(stream.name)
-            if not entry.judged and (verdict.weight < _CERTAIN or stream.name in self._others):
-                self._unsure.add(stream.name)
+                self._note_arrival(stream, entry.measurement, verdict)
             verdict, differs = replace(verdict, settled=settled), entry.differs(verdict)
             unsettled |= differs if entry.judged else verdict.weight < _SURE
             entry.judged = True
@@ -203,6 +198,15 @@ class Judge:
             else:
                 entry.verdict = replace(verdict, decision=entry.verdict.decision, at=entry.verdict.at)
         return unsettled
+
+    def _note_arrival(self, stream: LiveStream, m: Measurement, verdict: Verdict) -> None:
+        """Note what the first verdict on a measurement asks for."""
+        agrees = verdict.weight >= AGREES
+        self.denials.note(stream.name, m.stamp_ns, 0.0, agrees=agrees, outlier=True)
+        if not agrees:
+            self._refuted.add(stream.name)
+        if verdict.weight < _CERTAIN or stream.name in self._others:
+            self._unsure.add(stream.name)
 
     def _group(self, stream: LiveStream, back: int = 0) -> list[Entry]:
         """Return a group of `_GROUP` measurements of a stream that can still be judged, by stamp: the newest, or the `back`-th before it."""

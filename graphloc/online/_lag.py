@@ -33,13 +33,13 @@ from graphloc.solve._decide import AGREES
 from graphloc.solve._health import why_late
 from graphloc.solve._imu_noise import log_likelihood
 from graphloc.solve._warnings import noisier_warning
+from graphloc.solve._wrong_imu import most_motion
 
 # Of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10.
 _STEP_COST = 1.0
 _STEP_M = 0.3  # a commit that moves the newest state by more is followed by further iterations
 # Share of the measurements that denied an estimate, that must agree with another; and of a sensor with outliers.
 _EXPLAINED, _HALF = 0.8, 0.5
-_MOTION = 3.0  # sigmas of the motion in a gap (`factors.imu`), once and per second
 _MOST_STEPS, _STANDS = 10, 0.1  # largest number of iterations; relative change of the cost at which they end
 
 
@@ -277,7 +277,7 @@ class Lag:
                 return False
             agreeing += share >= (_EXPLAINED if stream.row.false is None else _HALF)
         lasts_s = (self.newest.stamp_ns - since_ns) * 1e-9
-        return agreeing >= 2 and 2.0 * self._states.steps_cost(since_ns) <= _MOTION**2 * (1.0 + lasts_s)
+        return agreeing >= 2 and 2.0 * self._states.steps_cost(since_ns) <= most_motion(lasts_s)
 
     def gone(self) -> list[LedgerRow]:
         """Return ledger rows of measurements that have left since this was last called."""

@@ -309,34 +309,17 @@ def live_problem(
         receivers: by sensor; missing ones are added.
         slow_known: names of the sensors whose slow error is known at the start.
     """
-    config, rows, mounts = setup.config, setup.rows, setup.mounts
-    t, R = mount_of(imu.sensor, imu_config, mounts)
-    by_name = rows_of(config, rows)
-    company = company_of(config, rows)
-    streams = {}
-    for number, (name, block) in enumerate(config.sensors.items()):
-        if name not in by_name:
-            continue
-        row = by_name[name]
-        slow, left_out = slow_or_left_out(row, block, company)
-        t_sensor, R_sensor = mount_of(name, block, mounts)
-        receiver = receivers.setdefault(name, ReceiverDetectors())
-        if left_out is not None and (receiver.jump.jumps or name in slow_known):
-            slow = without_drift(left_out)
-        streams[name] = LiveStream(
-            number=number,
-            name=name,
-            row=row,
-            config=block,
-            slow=slow,
-            left_out=left_out,
-            constants=row.constants(block),
-            shares=shared_constants(name, config),
-            mount=gtsam.Pose3(gtsam.Rot3(R_sensor), t_sensor - t),
-            scatter=Scatter(jumps=slow is not None and slow.jumps),
-            receiver=receiver,
-            jumps=receiver.jump.jumps,
+    config, by_name = setup.config, rows_of(setup.config, setup.rows)
+    t, R = mount_of(imu.sensor, imu_config, setup.mounts)
+    company = company_of(config, setup.rows)
+    streams = {
+        name: _live_stream(
+            setup, name, number, by_name[name], t, company,
+            receiver=receivers.setdefault(name, ReceiverDetectors()), known=name in slow_known,
         )
+        for number, name in enumerate(config.sensors)
+        if name in by_name
+    }  # fmt: skip
     jumps_ns = [jump.after_ns for stream in streams.values() if stream.may_jump for jump in stream.jumps]
     return LiveProblem(
         config=config,
@@ -348,6 +331,43 @@ def live_problem(
         links=setup.inertial.link(imu, imu_config, R, datum.gravity_mps2, noise_scale),
         streams=streams,
         motion_model=motion_model,
+    )
+
+
+def _live_stream(
+    setup: Setup,
+    name: str,
+    number: int,
+    row: Sensor,
+    t_body_imu_m: Array,
+    company: int,
+    *,
+    receiver: ReceiverDetectors,
+    known: bool,
+) -> LiveStream:
+    """Return the stream of a sensor, without measurements.
+
+    Args:
+        company: how many sensors can separate each other's slow errors from motion. known: its slow error is, at the start.
+    """
+    config = setup.config.sensors[name]
+    slow, left_out = slow_or_left_out(row, config, company)
+    if left_out is not None and (receiver.jump.jumps or known):
+        slow = without_drift(left_out)
+    t, R = mount_of(name, config, setup.mounts)
+    return LiveStream(
+        number=number,
+        name=name,
+        row=row,
+        config=config,
+        slow=slow,
+        left_out=left_out,
+        constants=row.constants(config),
+        shares=shared_constants(name, setup.config),
+        mount=gtsam.Pose3(gtsam.Rot3(R), t - t_body_imu_m),
+        scatter=Scatter(jumps=slow is not None and slow.jumps),
+        receiver=receiver,
+        jumps=receiver.jump.jumps,
     )
 
 

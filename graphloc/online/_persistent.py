@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from graphloc.config import SIGMA_SCALES, VesselConfig
+from graphloc.config import SIGMA_SCALES
 from graphloc.frames import Datum
 from graphloc.measurements import ImuSample
 from graphloc.motion_model import MotionModel
@@ -17,7 +17,8 @@ from graphloc.online._live import ReceiverDetectors
 from graphloc.online._noise import ImuNoise
 from graphloc.online._odometry import Odometry
 from graphloc.online._sensor_noise import SensorNoise
-from graphloc.online._snapshot import Snapshot, settings_of
+from graphloc.online._setup import Setup
+from graphloc.online._snapshot import Snapshot
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import UnmodelledError
 
@@ -80,7 +81,7 @@ class PersistentState:
             odometry=Odometry(found.anchor.stamp_ns, found.p_odom_m, found.R_odom_body),
         )
 
-    def snapshot(self, config: VesselConfig, anchor: Anchor, imu: ImuSample, agreed_ns: Mapping[str, int]) -> Snapshot:
+    def snapshot(self, setup: Setup, anchor: Anchor, imu: ImuSample, agreed_ns: Mapping[str, int]) -> Snapshot:
         """Return what a run can resume from after its process was killed.
 
         Args:
@@ -89,8 +90,8 @@ class PersistentState:
         assert self.datum is not None
         assert self.odometry is not None
         return Snapshot(
-            vessel=config.vessel,
-            settings=settings_of(config),
+            vessel=setup.config.vessel,
+            settings=setup.settings,
             anchor=anchor,
             imu=imu,
             datum=self.datum,

@@ -55,7 +55,7 @@ class ReceiverChecks:
             return ""
         if self._repeats(stream, m, at, told_m):
             return _FROZEN if stream.receiver.repeated_fix.frozen else _OLD
-        sigma_m = largest_sigma(residual.cov - _walked(residual, at))
+        sigma_m = largest_sigma(residual.white_cov)
         estimated_m = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2]
         if self._is_frozen(stream, m, told_m, estimated_m, sigma_m):
             return _FROZEN
@@ -131,11 +131,3 @@ class ReceiverChecks:
         """Return a line on each receiver whose position has jumped, or turned out to have been frozen, since this was last asked."""
         warnings, self._warnings = self._warnings, []
         return warnings
-
-
-def _walked(residual: Residual, at: Attachment) -> Array | float:
-    """Return the part of a residual's covariance (k, k) that its slow error adds between two of its nodes: no noise of the fix."""
-    if at.slow_walk is None or residual.slow_jacobian is None:
-        return 0.0
-    J = residual.slow_jacobian()
-    return np.asarray(J @ np.diag(at.slow_walk) @ J.T)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 from graphloc.build import mount_of, rows_of
 from graphloc.config import ImuConfig, VesselConfig
@@ -13,6 +14,9 @@ from graphloc.frames import Datum, yaw_from_rotation
 from graphloc.graph import Hint, InertialRow, Sensor
 from graphloc.measurements import Measurement
 from graphloc.recording import Mounts
+
+# Keys of what a sensor's slow state and constants are added to.
+_ADDED_TO = {"mount", "cameras", "lidars", "time_offset_s", "survey", "height_m"}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,6 +72,17 @@ class Setup:
     def absolute(self) -> tuple[str, ...]:
         """Names of the enabled sensors that measure position in world."""
         return tuple(name for name, row in rows_of(self.config, self.rows).items() if row.absolute)
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """By enabled sensor, as plain data, the axes of its slow state, and what this and its constants are added to."""
+        found = {}
+        for name, row in rows_of(self.config, self.rows).items():
+            sensor = self.config.sensors[name]
+            slow = row.slow(sensor)
+            added_to = sensor.model_dump(mode="json", include=_ADDED_TO)
+            found[name] = {**added_to, "slow_axes": [] if slow is None else list(slow.axes)}
+        return found
 
     def hint(self, m: Measurement, datum: Datum) -> Hint:
         """Return what a measurement says by itself."""

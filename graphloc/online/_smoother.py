@@ -446,7 +446,7 @@ class OnlineSmoother:
             found, self._configured_noise(), {n: setup.config.sensors[n] for n in setup.measuring}
         )
         try:
-            anchor = found.anchor_for(setup.config)
+            anchor = found.anchor_for(setup.settings)
             tracking = Tracking(self._setup, persistent, self._ledger, anchor, [found.imu, newest])
             persistent.unmodelled = tracking.lag.unmodelled(last=found.unmodelled)
         except Exception as error:  # noqa: BLE001 - as in `_advance`

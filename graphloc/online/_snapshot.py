@@ -11,16 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import in_one_line
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import ImuSample
 from graphloc.online._anchor import Anchor
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import ErrorSizes
-from graphloc.solve._batch import LARGEST_NOISE_SCALE
+from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE
 
-_VERSION = 8
+_VERSION = 9
 _EVERY_S = 2.0
 _MOST_TIMES = 1e4  # of a data sheet's noise, that an IMU on any engine has
 
@@ -36,7 +35,7 @@ class Snapshot:
             and on that of the accelerometer. sensor_noise: those of other sensors' sigmas (`SensorNoise.times`).
         heading: where no sensor measures it, how far it may be off.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
-        settings: by sensor, what slow states and constants in the anchor are added to (`settings_of`).
+        settings: by sensor, what slow states and constants in the anchor are, and what they are added to (`Setup.settings`).
         unmodelled: sizes of `UnmodelledError`; None where no slow error is left out, and the IMU's mount is right.
     """
 
@@ -54,9 +53,12 @@ class Snapshot:
     settings: Mapping[str, Any]
     unmodelled: ErrorSizes | None
 
-    def anchor_for(self, config: VesselConfig) -> Anchor:
-        """Return the anchor without what is known of sensors that are set otherwise now: corrected as told, they would be corrected twice."""
-        now = settings_of(config)
+    def anchor_for(self, now: Mapping[str, Any]) -> Anchor:
+        """Return the anchor without what is known of sensors that are set otherwise now: corrected as told, they would be corrected twice.
+
+        Args:
+            now: `Setup.settings`.
+        """
         same = {name for name, were in self.settings.items() if were == now.get(name)}
         return replace(
             self.anchor,
@@ -103,62 +105,48 @@ class Snapshot:
             raise ValueError("written by another version of graphloc")
         stamp, *six = raw["imu"]
         p, R = (np.array(raw["odom"][n], dtype=np.float64).reshape(shape) for n, shape in ((0, 3), (1, (3, 3))))
-        heights_m = {str(n): float(h) for n, h in raw["heights_m"].items()}
         scale, gyro, accel = (float(times) for times in raw["noise"])
-        sensor_noise = {
-            str(name): {str(key): float(by) for key, by in times.items()} for name, times in raw["sensor_noise"].items()
-        }
-        datum = Datum(Geodetic(*(float(v) for v in raw["datum"])))
         sizes = [np.array(of, dtype=np.float64) for of in raw["unmodelled"] or ()]
-        heading = None if raw["heading"] is None else UnmeasuredHeading(**raw["heading"])
-        raised = [scale, gyro, accel, *(by for times in sensor_noise.values() for by in times.values())]
-        numbers = np.concatenate(
-            [
-                p,
-                R.ravel(),
-                datum.origin,
-                list(heights_m.values()),
-                raised,
-                *(of.ravel() for of in sizes),
-                [] if heading is None else [heading.since_ns, heading.sigma_rad, heading.drift_radps],
-            ]
-        )
-        no_noise = not 1.0 <= min(raised) or scale > LARGEST_NOISE_SCALE or max(raised) > _MOST_TIMES
-        if not np.isfinite(numbers).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or no_noise:
-            raise ValueError("it is damaged")
-        return cls(
+        found = cls(
             vessel=str(raw["vessel"]),
             anchor=Anchor.from_dict(raw["anchor"]),
             imu=ImuSample(stamp_ns=int(stamp), sensor=sensor, seq=-1, accel_mps2=six[:3], gyro_radps=six[3:]),
-            datum=datum,
-            heights_m=heights_m,
+            datum=Datum(Geodetic(*(float(v) for v in raw["datum"]))),
+            heights_m={str(n): float(h) for n, h in raw["heights_m"].items()},
             agreed_ns={str(n): int(s) for n, s in raw["agreed_ns"].items()},
             noise=(scale, gyro, accel),
-            sensor_noise=sensor_noise,
-            heading=heading,
+            sensor_noise={
+                str(name): {str(key): float(by) for key, by in times.items()}
+                for name, times in raw["sensor_noise"].items()
+            },
+            heading=None if raw["heading"] is None else UnmeasuredHeading(**raw["heading"]),
             p_odom_m=p,
             R_odom_body=R,
             settings=dict(raw["settings"]),
             unmodelled=ErrorSizes(*sizes) if sizes else None,
         )
+        if not found._is_sound():
+            raise ValueError("it is damaged")
+        return found
 
-
-def settings_of(config: VesselConfig) -> dict[str, Any]:
-    """Return by sensor, as plain data, what its slow state and constants are added to: axes, mounts, time offset, survey, height; and which it has."""
-    said = {"axes", "through", "mount", "cameras", "lidars", "time_offset_s", "survey", "height_m"}
-    return {
-        name: {**sensor.model_dump(mode="json", include=said), "unknown": _unknown(sensor)}
-        for name, sensor in config.sensors.items()
-    }
-
-
-def _unknown(sensor: SensorConfig) -> list[str]:
-    """Return which parts the slow state of a speed or of poses has, of those that are left out where their sigma is 0."""
-    if not hasattr(sensor, "axes"):
-        return []
-    sigmas = sensor.model_dump(include={"scale_sigma", "mount_sigma_m", "mount_sigma_deg", "slow_error"})
-    sigmas |= sigmas.pop("slow_error", {})
-    return [key for key, sigma in sigmas.items() if sigma]
+    def _is_sound(self) -> bool:
+        """Whether its numbers, those of the anchor and of the sample aside, are ones that a run can have had."""
+        scale, heading, R = self.noise[0], self.heading, self.R_odom_body
+        raised = [*self.noise, *(by for times in self.sensor_noise.values() for by in times.values())]
+        numbers = np.concatenate(
+            [
+                self.p_odom_m,
+                R.ravel(),
+                self.datum.origin,
+                list(self.heights_m.values()),
+                raised,
+                *(of.ravel() for of in self.unmodelled or ()),
+                [] if heading is None else [heading.since_ns, heading.sigma_rad, heading.drift_radps],
+            ]
+        )
+        finite = bool(np.isfinite(numbers).all())
+        noise = 1.0 <= min(raised) and scale <= LARGEST_NOISE_SCALE and max(raised) <= _MOST_TIMES
+        return finite and noise and bool(np.abs(R @ R.T - np.eye(3)).max() <= 1e-3)
 
 
 class SnapshotFile:

@@ -27,10 +27,11 @@ from graphloc.online._unmeasured_heading import DOUBTFUL_RAD, UnmeasuredHeading
 from graphloc.online._unmodelled import BeforeStart
 from graphloc.recording import Recording
 from graphloc.solve._align import wanted_travel_m
-from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult, solve_batch
+from graphloc.solve._batch import BatchResult, solve_batch
 from graphloc.solve._covariances import ANY_HEADING_RAD, world_covariance
 from graphloc.solve._decide import AGREES, decisions
 from graphloc.solve._imu_mount import followed_before
+from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE
 from graphloc.solve._ledger import row_of
 from graphloc.solve._stretch import StretchStep, past_at
 from graphloc.solve._unmodelled import Unmodelled, unmodelled

@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 from bisect import insort
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from dataclasses import replace
 
@@ -21,6 +21,7 @@ from graphloc.measurements import ImuSample, ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._estimates import estimate_of
 from graphloc.online._heading_check import HeadingCheck
+from graphloc.online._heading_guess import HeadingGuess
 from graphloc.online._imu_doubt import ImuDoubt, turns_otherwise
 from graphloc.online._intake import series_of
 from graphloc.online._lag import Lag
@@ -32,7 +33,6 @@ from graphloc.online._propagate import advance_odometry, propagate, unpropagated
 from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
-from graphloc.online._start import LEAST_S
 from graphloc.solve._wrong_imu import WHY
 from graphloc.time import duration_ns, stamps_of, utc_text
 from graphloc.trajectory import Trajectory
@@ -40,7 +40,6 @@ from graphloc.trajectory import Trajectory
 log = logging.getLogger(__name__)
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
 _PENDING = 10_000  # measurements that may wait for the IMU
-_HEADINGS, _KEPT_HEADINGS = 3, 1000  # measurements of the heading that end a guess; that are remembered
 _TOLD_S = 60.0  # of data, by which the motion may tell a heading that was a guess
 _FROZEN = "frozen receiver: it repeats one position while the vessel moves; its fixes are rejected until it moves"
 _NO_LONGER_FROZEN = "no longer frozen: its fixes are used again"
@@ -83,8 +82,7 @@ class Tracking:
             place = np.asarray(pose.transformFrom(-self.lag.problem.t_body_imu_m))
             persistent.odometry = Odometry(anchor.stamp_ns, place, pose.rotation().matrix())
         self._odometry = persistent.odometry
-        self._guessed = False  # whether an event said that the heading is a guess
-        self._headed_ns: deque[int] = deque(maxlen=_KEPT_HEADINGS)  # stamps of measurements of it, while none was known
+        self._guess = HeadingGuess()
 
     def _built(
         self,
@@ -132,7 +130,7 @@ class Tracking:
         insort(self._pending, m, key=lambda p: p.stamp_ns)
         self._recent.keep(m)
         if self._persistent.heading is not None and np.isfinite(self._setup.hint(m, self.lag.problem.datum).yaw_rad):
-            self._headed_ns.append(m.stamp_ns)
+            self._guess.note(m.stamp_ns)
         if len(self._pending) > _PENDING:
             self._ledger.drop(self._pending.pop(), Outcome.REJECTED, "too many measurements wait for the IMU")
 
@@ -305,8 +303,7 @@ class Tracking:
 
     def heading_measured(self) -> bool:
         """Return whether sensors have measured the heading in the window, for as long as a start takes."""
-        told_ns = [at_ns for at_ns in self._headed_ns if at_ns >= self.lag.first_ns]
-        return len(told_ns) >= _HEADINGS and self.lag.newest.stamp_ns - min(told_ns) >= duration_ns(LEAST_S)
+        return self._guess.measured(self.lag.first_ns, self.lag.newest.stamp_ns)
 
     def since(self, stamp_ns: int) -> list[Measurement]:
         """Return what has come with stamps from `stamp_ns` on and can be used again, by stamp: what came late is among it."""
@@ -344,7 +341,9 @@ class Tracking:
         check, at_ns, known = self._persistent.heading_check, self.lag.newest.stamp_ns, self._persistent.heading
         guessed = known is not None and known.doubt(at_ns) != ""
         heading = [Event(check.said)] if check.look(self.lag, guessed=guessed) else []
-        heading += self._heading_news()
+        if known is not None:
+            self._persistent.heading, said = self._guess.follow(known, check, self.lag.first_ns, at_ns)
+            heading += said
         was, now = self._persistent.frozen, self.lag.frozen_receivers
         self._persistent.frozen = now
         frozen = [Event(f"{name}: {_FROZEN}") for name in sorted(now - was)]
@@ -360,25 +359,11 @@ class Tracking:
             *map(Event, [*self.lag.receiver_warnings(), *self.lag.noisier_warnings(), *self.lag.setting_warnings()]),
         ]
 
-    def _heading_news(self) -> list[Event]:
-        """Follow a heading that no sensor measures; return that it is a guess by now, or is none any more."""
-        known, at_ns, check = self._persistent.heading, self.lag.newest.stamp_ns, self._persistent.heading_check
-        if known is None:
-            return []
-        self._persistent.heading = known = known.narrowed(check.looked_ns, check.within_rad)
-        why, said = known.doubt(at_ns), self._guessed
-        if check.confirmed or (not why and self.heading_measured()):
-            self._persistent.heading, self._guessed = None, False
-            confirmed = Event("the motion confirms the heading: it is no guess any more", warns=False)
-            return [confirmed] if said and check.confirmed else []
-        self._guessed = said or bool(why)
-        return [Event(why, heading_guessed=True)] if why and not said else []
-
     def snapshot(self, newest: ImuSample) -> Snapshot:
         """Return the last anchor and all that is needed to go on from it; `newest`: sample of the IMU."""
         anchor = self._recent.anchors[-1]
         sample = self._recent.sample_at(anchor) or newest
-        return self._persistent.snapshot(self._setup.config, anchor, sample, self.lag.agreed_ns)
+        return self._persistent.snapshot(self._setup, anchor, sample, self.lag.agreed_ns)
 
     # Rebuild, end
 
@@ -396,9 +381,9 @@ class Tracking:
         """
         failed, recent, ledger = self.lag, self._recent, self._ledger
         ledger.enter(failed.gone())
-        anchors = [a for a in recent.anchors if a.stamp_ns >= failed.first_ns]
+        anchors = self._anchors()
         for anchor, without in [(anchors[0], False), (anchors[-1], True)] if anchors else []:
-            again = [m for m in self.since(anchor.stamp_ns) if not isinstance(m, ImuSample)]
+            again = self._again_from(anchor)
             mark = ledger.marked()
             try:
                 self._rebuild_from(anchor, [] if without else again, until_ns)
@@ -422,6 +407,14 @@ class Tracking:
         self.lag, self._pending = failed, [m for m in recent.others() if not ledger.has(m) and m.seq not in held]
         raise SolveError(f"{why}, and the window could not be rebuilt from an earlier state")
 
+    def _anchors(self) -> list[Anchor]:
+        """Return the anchors in the window, by stamp."""
+        return [a for a in self._recent.anchors if a.stamp_ns >= self.lag.first_ns]
+
+    def _again_from(self, anchor: Anchor) -> list[Measurement]:
+        """Return what can be used again in a window that begins at an anchor, but for the IMU samples, by stamp."""
+        return [m for m in self.since(anchor.stamp_ns) if not isinstance(m, ImuSample)]
+
     def _rebuild_from(self, anchor: Anchor, measurements: Sequence[Measurement], until_ns: int) -> None:
         self._unread, self._holes, self._pending = [], [], list(measurements)
         self.lag = self._built(anchor, self._recent.samples(), before=self.lag)
@@ -437,24 +430,13 @@ class Tracking:
         Returns:
             None: nothing has changed. Else the window is another, and this is to be said; empty: it was said before.
         """
-        denied = self.lag.denied
+        denied, replaced, anchors = self.lag.denied, self.lag, self._anchors()
         since_ns = self._doubt.suspected(denied, until_ns) if denied else None
-        failed, recent, ledger, persistent = self.lag, self._recent, self._ledger, self._persistent
-        anchors = [a for a in recent.anchors if failed.first_ns <= a.stamp_ns]
         if since_ns is None or not anchors or anchors[0].stamp_ns >= since_ns:
             return None
-        ledger.enter(failed.gone())
-        mark, doubt, pending, heights = ledger.marked(), deepcopy(self._doubt), self._pending, self._height_due_ns
-        # What learns from each measurement, and would from the trial as well.
-        receivers, check, model = persistent.receivers, persistent.heading_check, persistent.motion_model
-        scatters = {name: deepcopy(stream.scatter) for name, stream in failed.problem.streams.items()}
-        persistent.receivers, persistent.motion_model = deepcopy(receivers), deepcopy(model)
-        persistent.heading_check = HeadingCheck()  # its accelerations are wrong
-        for receiver in persistent.receivers.values():
-            receiver.jump.forget_since(since_ns)
-        self._doubt.leave_out(since_ns, until_ns)
-        out = recent.leave_out(since_ns)
-        again = [m for m in self.since(anchors[0].stamp_ns) if not isinstance(m, ImuSample)]
+        self._ledger.enter(replaced.gone())
+        again, said_before = self._again_from(anchors[0]), self._doubt.underway
+        take_back = self._begin_trial(since_ns, until_ns)
         try:
             self._rebuild_from(anchors[0], again, until_ns)
             explained = self.lag.explained(denied, min(denied.values()))
@@ -462,25 +444,44 @@ class Tracking:
             log.warning("online: the IMU could not be tried as wrong: %s", in_one_line(error))
             explained = False
         if not explained:
-            ledger.back_to(mark)
-            self.lag, self._pending, self._doubt = failed, pending, doubt
-            persistent.receivers, persistent.heading_check, persistent.motion_model = receivers, check, model
-            self._height_due_ns = heights
-            for name, stream in failed.problem.streams.items():
-                stream.scatter = scatters[name]
-            for m in out:
-                recent.keep(m)
+            take_back()
             return None
         self._held_out = []
         self._doubt.forget(self.lag.first_ns)
-        recent.forget_anchors(since_ns)
-        self._settle_rows(failed, again)
-        if doubt.underway:
+        self._recent.forget_anchors(since_ns)
+        self._settle_rows(replaced, again)
+        if said_before:
             return ""
         return (
             f"{self._setup.imu_name}: from {utc_text(since_ns)} on it {WHY} ({', '.join(sorted(denied))}): its samples are left out, as in "
             "an IMU gap, until they fit again"
         )
+
+    def _begin_trial(self, since_ns: int, until_ns: int) -> Callable[[], None]:
+        """Leave out the samples of the IMU between two stamps, and let the window be rebuilt; return what takes back both."""
+        ledger, recent, persistent = self._ledger, self._recent, self._persistent
+        mark, lag, pending, height_due_ns = ledger.marked(), self.lag, self._pending, self._height_due_ns
+        doubt = deepcopy(self._doubt)
+        # What learns from each measurement would from the trial as well, so that one has copies.
+        receivers, check, model = persistent.receivers, persistent.heading_check, persistent.motion_model
+        scatters = {name: deepcopy(stream.scatter) for name, stream in lag.problem.streams.items()}
+        persistent.receivers, persistent.motion_model = deepcopy(receivers), deepcopy(model)
+        persistent.heading_check = HeadingCheck()  # its accelerations are wrong
+        for receiver in persistent.receivers.values():
+            receiver.jump.forget_since(since_ns)
+        self._doubt.leave_out(since_ns, until_ns)
+        out = recent.leave_out(since_ns)
+
+        def take_back() -> None:
+            ledger.back_to(mark)
+            self.lag, self._pending, self._height_due_ns, self._doubt = lag, pending, height_due_ns, doubt
+            persistent.receivers, persistent.heading_check, persistent.motion_model = receivers, check, model
+            for name, stream in lag.problem.streams.items():
+                stream.scatter = scatters[name]
+            for m in out:
+                recent.keep(m)
+
+        return take_back
 
     def _goes_on_wrong(self) -> bool | None:
         """Return whether the samples that were left out last contradict the states that were made without them; None: too few to tell."""

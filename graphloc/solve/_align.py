@@ -88,16 +88,7 @@ def align(problem: Problem) -> Start:
         )
     still = standstill(problem, track, yaws)
     bias, bias_sigma, notes = gyro_bias(problem, window, still, yaws)
-    early = {name: rows for name, rows in yaws.items() if rows[0, 0] * bias_sigma[2] < _CARRIED_RAD}
-    noises = [(np.array([h.p_sigma_m[:2] for _, h in hints[stream.name]]), stream.row.slow(stream.config))
-              for stream in problem.streams if hints[stream.name]]  # fmt: skip
-    usual_m, least_m = wanted_travel_m(noises)
-    moved_s = _moved_at(track, usual_m)
-    if moved_s is None and not yaws and problem.config.start.heading_deg is None:
-        soon_s = _moved_at(track, least_m)
-        moved_s = soon_s if soon_s is not None and soon_s <= _LATEST_S else None
-    if early or (moved_s is not None and moved_s < min((rows[0, 0] for rows in yaws.values()), default=np.inf)):
-        yaws = early
+    yaws, moved_s = _heading_told_by(problem, hints, track, yaws, float(bias_sigma[2]))
     turn = _turns(problem, max([window, *(rows[0, 0] for rows in yaws.values())]) + 10.0 if yaws else 180.0, bias)
     at_start = still if still is not None and still[0] == 0.0 else None
     R_level, tilt_sigma, level, tilt_note = _level(problem, window, at_start, turn, bias)
@@ -120,6 +111,31 @@ def align(problem: Problem) -> Start:
         window_s=window_s,
         notes=(*notes, tilt_note, heading_note),
     )
+
+
+def _heading_told_by(
+    problem: Problem,
+    hints: dict[str, list[tuple[float, Hint]]],
+    track: Track,
+    yaws: dict[str, Array],
+    drift_radps: float,
+) -> tuple[dict[str, Array], float | None]:
+    """Return the measurements of heading that tell it at the start, and when (s) the vessel has moved far enough to tell it; None: it has not.
+
+    The gyroscope carries late ones back to the start, with a bias that is known to `drift_radps`: they are left out where others, or the
+    motion, tell the heading before.
+    """
+    early = {name: rows for name, rows in yaws.items() if rows[0, 0] * drift_radps < _CARRIED_RAD}
+    noises = [(np.array([h.p_sigma_m[:2] for _, h in hints[stream.name]]), stream.row.slow(stream.config))
+              for stream in problem.streams if hints[stream.name]]  # fmt: skip
+    usual_m, least_m = wanted_travel_m(noises)
+    moved_s = _moved_at(track, usual_m)
+    if moved_s is None and not yaws and problem.config.start.heading_deg is None:
+        soon_s = _moved_at(track, least_m)
+        moved_s = soon_s if soon_s is not None and soon_s <= _LATEST_S else None
+    if early or (moved_s is not None and moved_s < min((rows[0, 0] for rows in yaws.values()), default=np.inf)):
+        yaws = early
+    return yaws, moved_s
 
 
 def _hints(problem: Problem, origin: int) -> dict[str, list[tuple[float, Hint]]]:

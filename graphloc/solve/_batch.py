@@ -22,60 +22,32 @@ gentle losses; where that explains little, it is not the IMU, and its noise stay
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from graphloc.build import (
-    Problem,
-    StartPrior,
-    Stream,
-    Thinned,
-    bridged,
-    thinned,
-    with_noise_scale,
-    with_sensor_noise,
-    with_usual_motion,
-    without_sensor,
-)
+from graphloc.build import Problem, StartPrior, bridged, thinned, with_noise_scale, with_sensor_noise
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.recording import Progress, quiet
-from graphloc.solve._align import align
-from graphloc.solve._choices import other_choices, take_more_probable
-from graphloc.solve._decide import AGREES, Stage, Verdicts, agrees, met, weigh
-from graphloc.solve._grow import grow
+from graphloc.solve._decide import Stage, Verdicts
+from graphloc.solve._final_passes import LAST_PASSES, MAX_SENSOR_ROUNDS, SolvedRun, as_they_scatter
+from graphloc.solve._first_solution import CLEARLY, first_solution
 from graphloc.solve._imu_mount import MountError, with_mount_estimated
-from graphloc.solve._imu_noise import with_needed_noise
+from graphloc.solve._imu_noise import CONTRADICTION, noise_step, with_needed_noise
 from graphloc.solve._jumps import jumps_in, with_jumps_of, with_jumps_off_track
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
-from graphloc.solve._passes import (
-    Settled,
-    cost_as_configured,
-    cost_without_outliers,
-    expected_cost,
-    rough_passes,
-    settle,
-)
+from graphloc.solve._passes import cost_of_run, cost_without_outliers, rough_passes
 from graphloc.solve._sensor_noise import scattering
-from graphloc.solve._start import Begun, solve_start
+from graphloc.solve._start import Begun
 
-_MAX_NOISE_ROUNDS, _MAX_SENSOR_ROUNDS, _MAX_JUMP_ROUNDS = 4, 2, 2
-# Before other choices are tried, passes need not converge: what still changes then is a choice that confirms itself.
-_FIRST_PASSES, _LAST_PASSES = 6, 15
-# At most: over the thinned run after growing; with each gentle loss, where the IMU's noise has changed.
-_SEAM_PASSES, _OPEN_PASSES = 2, 4
-CONTRADICTION = 2.5  # cost over its expectation, from which the configured IMU noise is not believed
-LARGEST_NOISE_SCALE = 10.0  # no IMU is so many times noisier than configured
-# More noise of the IMU explains a misfit if it falls below that, or by this factor; else the noise stays as configured.
+_MAX_NOISE_ROUNDS, _MAX_JUMP_ROUNDS = 4, 2
+_OPEN_PASSES = 4  # at most, with each gentle loss, where the IMU's noise has changed
+# More noise of the IMU explains a misfit if it falls below what contradicts it, or by this factor; else the noise stays as configured.
 _EXPLAINED = 2.0
-# Share of a sensor's measurements that disagree, from which the run is tried without it; and below which it tells the heading.
-_OFTEN, _MOSTLY = 0.3, 0.7
-_SHORTER_S = 10.0, 5.0  # first windows, where the usual one contradicts itself
-_CLEARLY = 10.0  # log-likelihood by which a solution must be more probable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,14 +78,6 @@ class BatchResult:
         return replace(self, tree=gtsam.ISAM2(), graph=gtsam.NonlinearFactorGraph())
 
 
-def noise_step(ratio: float) -> float:
-    """Return the factor by which the IMU's noise is scaled up at once where the cost is `ratio` times its expectation.
-
-    At most by 3: modes and weights are chosen anew before it is looked at again.
-    """
-    return float(np.clip(np.sqrt(ratio), 1.5, 3.0))
-
-
 def solve_batch(
     problem: Problem,
     progress: Progress = quiet,
@@ -133,319 +97,179 @@ def solve_batch(
         ImuWrong: there are some.
         SolveError: it could not be started, or the linear algebra failed.
     """
-    configured = problem
-    begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
-    for _ in range(_MAX_SENSOR_ROUNDS):
-        if not begun.start.by_motion or solved.misfit() < CONTRADICTION:
-            break
-        # By the motion alone a start bends everything to fixes that state too little, and the IMU would be called noisier.
-        times = scattering(solved.problem, solved.settled.verdicts, denied=True)
-        if not times:
-            break
-        problem = replace(with_sensor_noise(solved.problem, times), usual_motion=None)
-        del solved  # and its graph, before the next one is made
-        begun, solved = _first_solution(problem, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
-    for _ in range(0 if newest else _MAX_JUMP_ROUNDS):
-        if (jumping := with_jumps_off_track(problem, solved.settled.verdicts)) is None:
-            break
-        without, count = (begun, solved.choice()), jumps_in(jumping) - jumps_in(problem)
-        lowest = _cost(problem, solved.settled.values, begun.prior) - _CLEARLY * count
-        del solved  # and its graph, before the next one is made
-        try:
-            begun, solved = _first_solution(jumping, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
-            clearly = _cost(jumping, solved.settled.values, begun.prior) < lowest
-        except SolveError:
-            clearly = False
-        if not clearly:
-            begun, choice = without
-            solved = choice.settled_again(begun.prior, progress)
-            break
-        problem = jumping
-    stated = with_jumps_of(problem, configured)
-    mount = None
+    run = _Underway(problem, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
+    run.raise_noise_of_sensors()
     if not newest:
-        solved, prior, mount = solved.with_mount_estimated(begun.prior, progress)
-        begun = begun._replace(prior=prior)
-    as_stated, misfit = solved.choice(), solved.misfit()
-    passes, iterations = solved.settled.passes, begun.iterations + solved.settled.iterations
-    for _ in range(_MAX_NOISE_ROUNDS):
-        problem, settled = solved
-        ratio, estimate = solved.misfit(), settled.values
-        if not problem.config.sensors[problem.imu.sensor].adapt_noise:
-            break
-        if ratio < CONTRADICTION:
-            noisier = with_needed_noise(problem, estimate, settled.verdicts, begun.prior)
-        else:
-            noisier = with_noise_scale(problem, problem.noise_scale * noise_step(ratio))
-        if noisier is None:
-            break
-        if begun.start.by_motion and ratio < CONTRADICTION:
-            # Which headings the motion excludes was found with the smaller noise.
-            again = solve_batch(replace(noisier, usual_motion=None), progress, newest=newest)
-            return replace(again, stated=with_jumps_of(again.stated, stated))
-        problem = bridged(noisier, estimate)
-        if ratio >= CONTRADICTION:
-            estimate, used, passed = rough_passes(
-                problem, estimate, begun.prior, progress, (Stage.FAR, Stage.OPEN), _OPEN_PASSES
-            )
-            passes, iterations = passes + passed, iterations + used
-        del settled, solved  # and their graph, before the next one is made
-        solved = _as_they_scatter(problem, thinned(problem), estimate, begun.prior, progress)
-        passes, iterations = passes + solved.settled.passes, iterations + solved.settled.iterations
-    scaled = solved.problem.noise_scale > as_stated.problem.noise_scale
-    if scaled and CONTRADICTION <= solved.misfit() and misfit < _EXPLAINED * solved.misfit():
-        del solved
-        solved = as_stated.settled_again(begun.prior, progress)
-        passes, iterations = passes + solved.settled.passes, iterations + solved.settled.iterations
-    problem, last = solved
-    problem, settled, prior, levels_cov, passed, used = at_usual_level(
-        problem, last, begun.prior, progress, _LAST_PASSES, newest=newest
-    )
-    passes, iterations = passes + passed, iterations + used
-    return BatchResult(
-        problem=problem,
-        stated=stated,
-        values=settled.values,
-        verdicts=settled.verdicts,
-        tree=bayes_tree(settled.graph, settled.values),
-        graph=settled.graph,
-        passes=passes,
-        iterations=iterations,
-        cost=cost_without_outliers(settled),
-        converged=settled.converged,
-        noise_scale=problem.noise_scale,
-        prior=prior,
-        heading_var=begun.heading_var,
-        begun=begun.last,
-        headings=begun.headings if begun.start.yaw_sigma_rad < np.pi else 0,
-        levels_cov=levels_cov,
-        mount=mount if settled.values is as_stated.values else None,
-        notes=begun.start.notes,
-    )
+        run.take_jumps()
+        run.estimate_mount()
+    noisier = run.raise_imu_noise()
+    if noisier is not None:
+        stated = run.stated
+        del run  # and its graph, before the next one is made
+        again = solve_batch(noisier, progress, newest=newest)
+        return replace(again, stated=with_jumps_of(again.stated, stated))
+    return run.at_usual_level()
 
 
-class _Choice(NamedTuple):
-    """A solution without its graph, which takes gigabytes on a run of hours."""
+class _Underway:
+    """A run on its way through the steps of `solve_batch`, each of which leaves another solution in its place.
 
-    problem: Problem
-    values: gtsam.Values
-    verdicts: Verdicts
+    It alone refers to the solution: of a run of hours the graph takes gigabytes, and must be gone before the next one is made.
 
-    def settled_again(self, prior: StartPrior, progress: Progress) -> _Solved:
-        return _Solved(self.problem, settle(*self, prior, progress, _LAST_PASSES))
-
-
-class _Solved(NamedTuple):
-    """A run after its final passes, and the problem with the noise that it was solved with."""
-
-    problem: Problem
-    settled: Settled
-
-    def misfit(self) -> float:
-        """Return the cost over its expectation."""
-        return cost_without_outliers(self.settled) / max(expected_cost(self.problem, self.settled.verdicts), 1.0)
-
-    def with_mount_estimated(
-        self, prior: StartPrior, progress: Progress
-    ) -> tuple[_Solved, StartPrior, MountError | None]:
-        """Return it with the mount of the IMU as the other sensors have it, the prior of the start there, and what that says of it."""
-        problem, settled, prior, error = with_mount_estimated(*self, prior, progress, _LAST_PASSES)
-        if settled is self.settled:
-            return self, prior, error
-        passes, iterations = (getattr(self.settled, key) + getattr(settled, key) for key in ("passes", "iterations"))
-        return _Solved(problem, replace(settled, passes=passes, iterations=iterations)), prior, error
-
-    def choice(self) -> _Choice:
-        return _Choice(self.problem, self.settled.values, self.settled.verdicts)
-
-
-def _first_solution(
-    problem: Problem, progress: Progress, *, newest: bool, doubt_imu: bool, near_rad: float | None
-) -> tuple[Begun, _Solved]:
-    """Solve a run with the IMU's noise as it is.
-
-    Where that contradicts the other sensors, the run is begun without each sensor of heading or velocity, too; else without those of
-    them that disagree for long. If all measurements are clearly more probable in such a solution, it is taken: a compass that is wrong
-    for most of a run may lead the heading away, where nothing leads back. Not for `newest`, as a start online has no time for it.
+    Attributes:
+        begun, solved: the solution, and the start that it was grown from.
+        passes, iterations: that it took.
+        mount: what the solution says of the mount of the IMU; None: not reckoned for this one.
     """
-    few = thinned(problem)
-    begun = whole = _begin(problem, few, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
-    solved = _from_there(problem, few, begun, progress)
-    misfit = solved.misfit()
-    doubted = [] if newest else [
-        number
-        for number, stream in enumerate(problem.streams)
-        if stream.row.false is None
-        and not stream.row.absolute
-        and (misfit >= CONTRADICTION or _off_for_long(_off(stream, solved.settled.verdicts)))
-    ]  # fmt: skip
-    if not doubted:
-        return begun, solved
 
-    lowest, best = _cost(problem, solved.settled.values, begun.prior) - _CLEARLY, (begun, solved.choice())
-    iterations, passes = begun.iterations + solved.settled.iterations, solved.settled.passes
-    del solved  # and its graph, before the next one is made
-    for number in doubted:
-        rest = without_sensor(problem, problem.streams[number])
+    def __init__(
+        self, problem: Problem, progress: Progress, *, newest: bool, doubt_imu: bool, near_rad: float | None
+    ) -> None:
+        self._configured, self._progress, self._newest = problem, progress, newest
+        self._solve = partial(first_solution, progress=progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
+        self._solve_first(problem)
+
+    def _solve_first(self, problem: Problem) -> None:
+        """Solve a problem from its start."""
+        self._hold(*self._solve(problem))
+        self._problem = problem
+
+    def _hold(self, begun: Begun, solved: SolvedRun, mount: MountError | None = None) -> None:
+        """Hold a solution, and count what it took from its start."""
+        self.begun, self.solved, self.mount = begun, solved, mount
+        self.passes, self.iterations = solved.settled.passes, begun.iterations + solved.settled.iterations
+
+    def _go_on_with(self, solved: SolvedRun) -> None:
+        """Hold a solution that was found from the one before."""
+        self.solved, self.mount = solved, None
+        self._count(solved.settled.passes, solved.settled.iterations)
+
+    def _count(self, passes: int, iterations: int) -> None:
+        """Add what was done to what the solution took."""
+        self.passes, self.iterations = self.passes + passes, self.iterations + iterations
+
+    @property
+    def stated(self) -> Problem:
+        """The problem as configured, with the position jumps that were found."""
+        return with_jumps_of(self._problem, self._configured)
+
+    def raise_noise_of_sensors(self) -> None:
+        """Solve it anew where sensors that scatter more than they state may have misled a start by the motion alone.
+
+        It bends everything to fixes that state too little, and the IMU would be called noisier.
+        """
+        for _ in range(MAX_SENSOR_ROUNDS):
+            if not self.begun.start.by_motion or self.solved.misfit() < CONTRADICTION:
+                return
+            problem = self.solved.problem
+            times = scattering(problem, self.solved.settled.verdicts, denied=True)
+            if not times:
+                return
+            del self.solved  # and its graph, before the next one is made
+            self._solve_first(replace(with_sensor_noise(problem, times), usual_motion=None))
+
+    def take_jumps(self) -> None:
+        """Solve it anew with the position jumps that the solution shows, while that is clearly more probable."""
+        for _ in range(_MAX_JUMP_ROUNDS):
+            jumping = with_jumps_off_track(self._problem, self.solved.settled.verdicts)
+            if jumping is None or not self._clearly_jumps(jumping):
+                return
+
+    def _clearly_jumps(self, jumping: Problem) -> bool:
+        """Return whether a problem with more jumps is clearly more probable, each of them; else the solution stays what it was."""
+        problem, begun, before = self._problem, self.begun, self.solved.choice()
+        lowest = cost_of_run(problem, before.values, begun.prior)
+        lowest -= CLEARLY * (jumps_in(jumping) - jumps_in(problem))
+        del self.solved  # and its graph, before the next one is made
         try:
-            begun = _begin(rest, thinned(rest), progress, newest=newest)
+            self._solve_first(jumping)
+            if cost_of_run(jumping, self.solved.settled.values, self.begun.prior) < lowest:
+                return True
         except SolveError:
-            continue
-        solved = _from_there(problem, few, begun, progress)
-        iterations += begun.iterations + solved.settled.iterations
-        passes += solved.settled.passes
-        if (found := _cost(problem, solved.settled.values, begun.prior)) < lowest:
-            if _off(problem.streams[number], solved.settled.verdicts).mean() < _MOSTLY:
-                # The sensor tells the heading after all.
-                begun = whole._replace(values=begun.values, prior=begun.prior)
-            lowest, best = found, (begun, solved.choice())
-        del solved
-    begun, choice = best
-    again = choice.settled_again(begun.prior, progress)
-    settled = replace(again.settled, passes=again.settled.passes + passes)
-    return begun._replace(iterations=iterations), again._replace(settled=settled)
+            pass  # it cannot be solved with them
+        self._problem = problem
+        self._hold(begun, before.settled_again(begun.prior, self._progress))
+        return False
 
+    def estimate_mount(self) -> None:
+        """Turn the mount of the IMU to where the other sensors have it."""
+        before = self.solved.settled
+        problem, settled, prior, mount = with_mount_estimated(
+            *self.solved, self.begun.prior, self._progress, LAST_PASSES
+        )
+        if settled is not before:
+            passes, iterations = before.passes + settled.passes, before.iterations + settled.iterations
+            settled = replace(settled, passes=passes, iterations=iterations)
+        self._hold(self.begun._replace(prior=prior), SolvedRun(problem, settled), mount)
 
-def _cost(problem: Problem, values: gtsam.Values, prior: StartPrior) -> float:
-    """Return -log of how probable a run is (but for a constant), with each sensor's loss as wide as configured."""
-    last = len(problem.timeline) - 1
-    return cost_as_configured(problem, values, 0, last, prior, judged=last)
+    def raise_imu_noise(self) -> Problem | None:
+        """Raise the noise of the IMU where the run needs it, round by round; where that explains little, it stays as configured.
 
-
-def _off(stream: Stream, verdicts: Verdicts) -> NDArray[np.bool_]:
-    """Return which of its measurements disagree."""
-    return np.array([verdicts[stream.number, i].weight < AGREES for i in range(len(stream.measurements))])
-
-
-def _off_for_long(off: NDArray[np.bool_]) -> bool:
-    """Whether many measurements disagree, and in a row: as many scattered outliers change twice as often."""
-    share = float(off.mean())
-    return bool(share > _OFTEN and np.count_nonzero(off[1:] != off[:-1]) < share * (1.0 - share) * len(off))
-
-
-def _begin(
-    problem: Problem,
-    few: Thinned,
-    progress: Progress,
-    *,
-    newest: bool,
-    doubt_imu: bool = False,
-    near_rad: float | None = None,
-) -> Begun:
-    """Start a run, grow it over the thinned one, and fill in the other states."""
-    start = align(problem)
-    begun = solve_start(few.problem, start if near_rad is None else start.near(near_rad), progress, newest=newest)
-    doubt_start = doubt_imu and begun.excess >= CONTRADICTION
-    if doubt_start and (other := _begun_without_a_sensor(problem, few, begun, progress)) is not None:
-        begun, doubt_start = other, False
-    if doubt_start:
-        _doubt_at_once(few.problem, begun.last, progress)
-    grown, prior, known, iterations, *_ = begun
-    iterations += grow(few.problem, grown, prior, known, progress, doubt_imu=doubt_imu, doubt_start=doubt_start)
-    grown, used, _ = rough_passes(few.problem, grown, prior, progress, (Stage.FINAL,), _SEAM_PASSES)
-    stamps, few_stamps = problem.timeline.stamps_ns, few.problem.timeline.stamps_ns[: known + 1]
-    return begun._replace(
-        values=few.filled(problem, grown),
-        last=int(few.states[known]),
-        iterations=iterations + used,
-        heading_var=np.interp(stamps, few_stamps, begun.heading_var),
-    )
-
-
-def _begun_without_a_sensor(problem: Problem, few: Thinned, begun: Begun, progress: Progress) -> Begun | None:
-    """Return the start without one of the sensors of heading or velocity, if it contradicts itself no longer and is clearly more probable."""
-
-    def cost(values: gtsam.Values, prior: StartPrior, last: int) -> float:
-        return cost_as_configured(few.problem, values, 0, last, prior, judged=last)
-
-    lowest, best, iterations = -_CLEARLY, None, begun.iterations
-    for stream in few.problem.streams:
-        if stream.row.absolute or stream.row.false is not None or not stream.measurements:
-            continue
-        whole = next(s for s in problem.streams if s.number == stream.number)
-        rest, window_s = without_sensor(few.problem, stream), problem.config.start.window_s
-        try:
-            other = solve_start(rest, align(without_sensor(problem, whole)), progress, newest=True, window_s=window_s)
-        except SolveError:
-            continue
-        iterations += other.iterations
-        last = min(begun.last, other.last)
-        higher = cost(other.values, other.prior, last) - cost(begun.values, begun.prior, last)
-        if other.excess < CONTRADICTION and higher < lowest:
-            lowest, best = higher, (stream, other)
-    if best is None:
+        Returns:
+            A problem that is to be solved instead, from its start: with noise that the residuals need, where only the smaller noise
+            excluded headings. Else None.
+        """
+        as_stated, misfit = self.solved.choice(), self.solved.misfit()
+        for _ in range(_MAX_NOISE_ROUNDS):
+            contradicted = self.solved.misfit() >= CONTRADICTION
+            noisier = self._with_noisier_imu(contradicted=contradicted)
+            if noisier is None:
+                break
+            if self.begun.start.by_motion and not contradicted:
+                return replace(noisier, usual_motion=None)
+            self._settle_with(noisier, gently=contradicted)
+        scaled = self.solved.problem.noise_scale > as_stated.problem.noise_scale
+        left = self.solved.misfit()
+        if scaled and CONTRADICTION <= left and misfit < _EXPLAINED * left:
+            del self.solved  # and its graph, before the next one is made
+            self._go_on_with(as_stated.settled_again(self.begun.prior, self._progress))
         return None
-    stream, other = best
-    _, residuals = met(few.problem, stream, stream.between(0, other.last), other.values)
-    agree = np.mean([any(agrees(stream, residual) for residual in found) for found in residuals])
-    # Where it tells the heading after all, no other one is in doubt.
-    heading_var = np.zeros(other.last + 1) if agree > 1.0 - _MOSTLY else other.heading_var
-    return begun._replace(
-        values=other.values, prior=other.prior, last=other.last, iterations=iterations, heading_var=heading_var
-    )
 
+    def _with_noisier_imu(self, *, contradicted: bool) -> Problem | None:
+        """Return the problem with the noise of its IMU scaled up; where that does not contradict the others, as its residuals need it.
 
-def _doubt_at_once(problem: Problem, last: int, progress: Progress) -> None:
-    """Look for an IMU that is wrong in the first window, until state `last`: it spoils all that is aligned and solved there.
+        None where they need no more, or it is not to be adapted.
+        """
+        problem, settled = self.solved
+        if not problem.config.sensors[problem.imu.sensor].adapt_noise:
+            return None
+        if contradicted:
+            return with_noise_scale(problem, problem.noise_scale * noise_step(self.solved.misfit()))
+        return with_needed_noise(problem, settled.values, settled.verdicts, self.begun.prior)
 
-    So the run is begun with less of it, and grown from there.
+    def _settle_with(self, noisier: Problem, *, gently: bool) -> None:
+        """Go on with other noise of the IMU; `gently`: with gentle losses first."""
+        estimate, prior = self.solved.settled.values, self.begun.prior
+        problem = bridged(noisier, estimate)
+        if gently:
+            gentle = Stage.FAR, Stage.OPEN
+            estimate, used, passed = rough_passes(problem, estimate, prior, self._progress, gentle, _OPEN_PASSES)
+            self._count(passed, used)
+        del self.solved  # and its graph, before the next one is made
+        self._go_on_with(as_they_scatter(problem, thinned(problem), estimate, prior, self._progress))
 
-    Raises:
-        ImuWrong: it is.
-    """
-    config = problem.config
-    for window_s in _SHORTER_S:
-        start = config.start.model_copy(update={"window_s": window_s})
-        shorter = replace(problem, config=config.model_copy(update={"start": start}))
-        try:
-            values, prior, known, *_ = solve_start(shorter, align(shorter), progress, newest=True, window_s=window_s)
-            grow(problem, values, prior, known, progress, doubt_imu=True, last=last)
-        except SolveError:
-            continue
-
-
-def _from_there(problem: Problem, few: Thinned, begun: Begun, progress: Progress) -> _Solved:
-    """Make the final passes from a grown run."""
-    if problem.links.gaps():
-        problem = bridged(problem, begun.values)
-    problem = with_usual_motion(problem, begun.values)
-    if problem.usual_motion is not None or problem.links.gaps():
-        few = thinned(problem)
-    return _as_they_scatter(problem, few, begun.values, begun.prior, progress)
-
-
-def _as_they_scatter(
-    problem: Problem, few: Thinned, estimate: gtsam.Values, prior: StartPrior, progress: Progress
-) -> _Solved:
-    """Make the final passes, again with larger sigmas of the sensors that scatter more than they state (see `_sensor_noise`)."""
-    passes = iterations = 0
-    for more in range(_MAX_SENSOR_ROUNDS, -1, -1):
-        settled = _final_passes(problem, few, estimate, prior, progress)
-        passes, iterations, estimate = passes + settled.passes, iterations + settled.iterations, settled.values
-        if not more or not (times := scattering(problem, settled.verdicts)):
-            break
-        problem = with_sensor_noise(problem, times)
-        few = thinned(problem)
-    return _Solved(problem, replace(settled, passes=passes, iterations=iterations))
-
-
-def _final_passes(
-    problem: Problem, few: Thinned, estimate: gtsam.Values, prior: StartPrior, progress: Progress
-) -> Settled:
-    """Re-choose modes and weights over the whole run until they no longer change, and try other choices (see `_choices`).
-
-    A choice confirms itself, because the estimate follows it; another one that is more probable replaces it.
-    """
-    last = len(problem.timeline) - 1
-    verdicts = weigh(problem, estimate, first=0, last=last, stage=Stage.FINAL)
-    settled = settle(problem, estimate, verdicts, prior, progress, _FIRST_PASSES)
-    changed, iterations = False, settled.iterations
-    for others, used in other_choices(problem, few, settled, prior):
-        changed = take_more_probable(problem, settled, others, prior) or changed
-        iterations += used
-    if settled.converged and not changed:
-        return replace(settled, iterations=iterations)
-    values, verdicts, passes = settled.values, settled.verdicts, settled.passes
-    del settled  # and its graph, before the next one is made
-    again = settle(problem, values, verdicts, prior, progress, _LAST_PASSES)
-    return replace(again, iterations=iterations + again.iterations, passes=passes + again.passes)
+    def at_usual_level(self) -> BatchResult:
+        """Return the result, with the most probable level of receivers that jump as the usual one."""
+        found = at_usual_level(*self.solved, self.begun.prior, self._progress, LAST_PASSES, newest=self._newest)
+        self._count(found.passes, found.iterations)
+        problem, settled, begun = found.problem, found.settled, self.begun
+        return BatchResult(
+            problem=problem,
+            stated=self.stated,
+            values=settled.values,
+            verdicts=settled.verdicts,
+            tree=bayes_tree(settled.graph, settled.values),
+            graph=settled.graph,
+            passes=self.passes,
+            iterations=self.iterations,
+            cost=cost_without_outliers(settled),
+            converged=settled.converged,
+            noise_scale=problem.noise_scale,
+            prior=found.prior,
+            heading_var=begun.heading_var,
+            begun=begun.last,
+            headings=begun.headings if begun.start.yaw_sigma_rad < np.pi else 0,
+            levels_cov=found.others_cov,
+            mount=self.mount if settled is self.solved.settled else None,
+            notes=begun.start.notes,
+        )

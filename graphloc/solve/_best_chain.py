@@ -9,6 +9,7 @@ between them.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,44 +49,87 @@ def best_chain(
     stamps = np.asarray(stamps_of(taken) * 1e-9, dtype=np.float64)
     walk = np.array([walk_of(m) for m in models])
     gained = _gained_by_repeats(models, residuals, predictions, nothing, stamps, walk)
-    node = [(n, mode) for n, found in enumerate(residuals) for mode in range(len(found))]
-    at = np.array([n for n, _ in node])
-    raw = np.array([residuals[n][mode].raw for n, mode in node])
-    cov = np.array([residuals[n][mode].cov for n, mode in node])
-    alone = np.log([residuals[n][mode].prior for n, mode in node]) - nothing[at]
-    bound = None
-    if predictions is not None:
-        bound = np.array([p.root for p in predictions])[at], np.array([p.lasts_s for p in predictions])[at]
-    score, before = np.zeros(len(node)), np.full(len(node), -1)
+    nodes = _nodes(residuals, predictions, nothing)
+    at, size = nodes.at, len(nodes.at)
+    score, before = np.zeros(size), np.full(size, -1)
     for k, n in enumerate(at):
-        if predictions is None:
-            nis, begun = float(dof), cov[k] + models[n].cov
-        else:
-            begun = cov[k] + predictions[n].cov
-            nis = float(raw[k] @ np.linalg.solve(begun, raw[k]))
-        news = models[n].news
-        score[k] = gained[n] + news * (alone[k] - 0.5 * np.linalg.slogdet(2.0 * np.pi * begun)[1]) - 0.5 * nis
+        score[k] = _begun(nodes, k, models[n], float(gained[n]))
         lo, hi = np.searchsorted(at, [n - _LOOK_BACK, n])
         if lo == hi:
             continue
         ages_s = stamps[n] - stamps[at[lo:hi]]
-        expected, left = raw[lo:hi], cov[lo:hi]
-        if bound is not None:
-            roots, lasts_s = bound
-            kept = kept_of(lasts_s[lo:hi], lasts_s[k], ages_s)
-            expected, left = carried(expected, left, roots[lo:hi], roots[k], kept)
-        spread, step = left + cov[k] + ages_s[:, None, None] * walk[n], expected - raw[k]
-        off = np.einsum("ni,ni->n", step, np.linalg.solve(spread, step[:, :, None])[:, :, 0])
-        path = score[lo:hi] + news * (alone[k] - 0.5 * (off + np.linalg.slogdet(2.0 * np.pi * spread)[1]))
+        path = score[lo:hi] + _followed(nodes, k, slice(lo, hi), ages_s, models[n].news, walk[n])
         path += np.maximum(gained[n] - gained[np.minimum(at[lo:hi] + 2, n)], 0.0)
         best = int(np.argmax(path))
         if path[best] > score[k]:
             score[k], before[k] = path[best], lo + best
     ends = score + np.maximum(gained[count] - gained[np.minimum(at + 2, count)], 0.0)
     chosen: list[int | None] = [None] * count
-    for n, mode in (node[k] for k in _backwards(int(np.argmax(ends)), before)):
-        chosen[n] = mode
+    for k in _backwards(int(np.argmax(ends)), before):
+        chosen[at[k]] = int(nodes.mode[k])
     return chosen
+
+
+class _Nodes(NamedTuple):
+    """The K modes of all measurements, each of which may be on the chain.
+
+    Attributes:
+        at: (K,) number of its measurement. mode: (K,) which of its modes.
+        raw: (K, k). cov: (K, k, k). alone: (K,) log of its prior over the density of a false measurement by itself.
+        roots: (K, k, m). lasts_s: (K,) of its prediction; None: nothing is predicted.
+    """
+
+    at: NDArray[np.int64]
+    mode: NDArray[np.int64]
+    raw: Array
+    cov: Array
+    alone: Array
+    roots: Array | None
+    lasts_s: Array | None
+
+
+def _nodes(
+    residuals: Sequence[tuple[Residual, ...]], predictions: Sequence[Prediction] | None, nothing: Array
+) -> _Nodes:
+    """Return the nodes; arguments as of `best_chain` and `_gained_by_repeats`."""
+    modes = [residual for found in residuals for residual in found]
+    at = np.repeat(np.arange(len(residuals)), [len(found) for found in residuals])
+    return _Nodes(
+        at=at,
+        mode=np.concatenate([np.arange(len(found)) for found in residuals]),
+        raw=np.array([r.raw for r in modes]),
+        cov=np.array([r.cov for r in modes]),
+        alone=np.log([r.prior for r in modes]) - nothing[at],
+        roots=None if predictions is None else np.array([p.root for p in predictions])[at],
+        lasts_s=None if predictions is None else np.array([p.lasts_s for p in predictions])[at],
+    )
+
+
+def _begun(nodes: _Nodes, k: int, model: FalseModel, gained: float) -> float:
+    """Return the log likelihood ratio of a chain that begins at node k; `gained`: by false ones before it."""
+    raw, cov = nodes.raw[k], nodes.cov[k]
+    if nodes.roots is None:
+        nis, begun = float(len(raw)), cov + model.cov
+    else:
+        begun = cov + nodes.roots[k] @ nodes.roots[k].T
+        nis = float(raw @ np.linalg.solve(begun, raw))
+    return float(gained + model.news * (nodes.alone[k] - 0.5 * np.linalg.slogdet(2.0 * np.pi * begun)[1]) - 0.5 * nis)
+
+
+def _followed(nodes: _Nodes, k: int, back: slice, ages_s: Array, news: float, walk: Array) -> Array:
+    """Return the log likelihood ratio (J,) that node k adds to chains that end at each of J nodes before it.
+
+    Args:
+        back: these nodes. ages_s: (J,) time since each. news: of the measurement. walk: (k, k), see `walk_of`.
+    """
+    raw, cov = nodes.raw[k], nodes.cov[k]
+    expected, left = nodes.raw[back], nodes.cov[back]
+    if nodes.roots is not None and nodes.lasts_s is not None:
+        kept = kept_of(nodes.lasts_s[back], nodes.lasts_s[k], ages_s)
+        expected, left = carried(expected, left, nodes.roots[back], nodes.roots[k], kept)
+    spread, step = left + cov + ages_s[:, None, None] * walk, expected - raw
+    off = np.einsum("ni,ni->n", step, np.linalg.solve(spread, step[:, :, None])[:, :, 0])
+    return np.asarray(news * (nodes.alone[k] - 0.5 * (off + np.linalg.slogdet(2.0 * np.pi * spread)[1])))
 
 
 def _backwards(k: int, before: NDArray[np.int64]) -> Iterator[int]:

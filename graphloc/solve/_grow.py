@@ -22,7 +22,7 @@ from graphloc.solve._stretch import (
     solve_until_written_there,
     update_states,
 )
-from graphloc.solve._wrong_imu import ImuWrong, wrong_span
+from graphloc.solve._wrong_imu import GrownWindow, ImuWrong, wrong_span
 
 _CHUNK_S, _OVERLAP_S = 15.0, 5.0
 _SETTLED_M = 0.5
@@ -60,8 +60,8 @@ def grow(
     verdicts = weigh(problem, estimate, first=0, last=known, stage=Stage.FINAL)
     step = solve_stretch(problem, estimate, 0, known, prior, decisions(verdicts))
     iterations, first = step.iterations, 0
-    found = _without_imu(problem, estimate, 0, 0, known, prior, gtsam.Values()) if doubt_imu and doubt_start else None
-    if found is not None:
+    window = GrownWindow(problem, estimate, 0, 0, known, prior)
+    if doubt_imu and doubt_start and (found := _without_imu(window, gtsam.Values())) is not None:
         problem, step, verdicts, more = found
         iterations += more
     while known < end:
@@ -73,8 +73,9 @@ def grow(
             first = start_of_window
         before = copy_states(problem, estimate, first, known)
         dead_reckon(problem, estimate, known, until)
-        used, step, verdicts = _solve_grown(problem, estimate, first, known, until, prior)
-        if doubt_imu and (found := _without_imu(problem, estimate, first, known, until, prior, before)) is not None:
+        window = GrownWindow(problem, estimate, first, known, until, prior)
+        used, step, verdicts = _solve_grown(window)
+        if doubt_imu and (found := _without_imu(window, before)) is not None:
             problem, step, verdicts, more = found
             used += more
         watch(until, verdicts)
@@ -85,39 +86,30 @@ def grow(
     return iterations
 
 
-def _without_imu(
-    problem: Problem,
-    values: gtsam.Values,
-    first: int,
-    known: int,
-    last: int,
-    prior: StartPrior | Past,
-    before: gtsam.Values,
-) -> tuple[Problem, StretchStep, Verdicts, int] | None:
-    """Return the problem without the IMU where it is wrong in a window, and this solved, in place; None: it is not wrong."""
+def _without_imu(window: GrownWindow, before: gtsam.Values) -> tuple[Problem, StretchStep, Verdicts, int] | None:
+    """Return the problem without the IMU where it is wrong in a window, and this solved, in place; None: it is not wrong.
 
-    def solve(rest: Problem) -> None:
-        _solve_grown(rest, values, first, known, last, prior)
-
-    span = wrong_span(problem, values, first, known, last, prior, before, solve)
+    Args:
+        before: as of `wrong_span`.
+    """
+    span = wrong_span(window, before, lambda rest: _solve_grown(window._replace(problem=rest)))
     if span is None:
         return None
-    problem = without_imu(problem, values, *span)
-    iterations, step, verdicts = _solve_grown(problem, values, first, known, last, prior)
-    return problem, step, verdicts, iterations
+    rest = without_imu(window.problem, window.values, *span)
+    iterations, step, verdicts = _solve_grown(window._replace(problem=rest))
+    return rest, step, verdicts, iterations
 
 
-def _solve_grown(
-    problem: Problem, values: gtsam.Values, first: int, known: int, last: int, prior: StartPrior | Past
-) -> tuple[int, StretchStep, Verdicts]:
-    """Solve a window whose states after `known` are new, in place; return iterations, the last step and its verdicts.
+def _solve_grown(window: GrownWindow) -> tuple[int, StretchStep, Verdicts]:
+    """Solve a window, in place; return iterations, the last step and its verdicts.
 
     New hypotheses are judged only after the other measurements have given an estimate with its covariance: with false matches in it, a
     window solved with Huber losses alone is off by many of its own sigmas (0.01 rad/s of gyro bias, 300 m after 20 s of dead
     reckoning).
     """
+    problem, values, first, known, last, prior = window
     fresh = _fresh(problem, known, last)
-    step, verdicts, iterations = _solve_without(problem, values, first, known, last, prior, fresh)
+    step, verdicts, iterations = _solve_without(window, fresh)
     if not fresh:
         return iterations, step, verdicts
     predicted = predicted_covariance(bayes_tree(step.graph, step.values))
@@ -137,21 +129,14 @@ def _fresh(problem: Problem, known: int, last: int) -> set[tuple[int, int]]:
     return {(s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)}
 
 
-def _solve_without(
-    problem: Problem,
-    values: gtsam.Values,
-    first: int,
-    known: int,
-    last: int,
-    prior: StartPrior | Past,
-    fresh: Container[tuple[int, int]],
-) -> tuple[StretchStep, Verdicts, int]:
+def _solve_without(window: GrownWindow, fresh: Container[tuple[int, int]]) -> tuple[StretchStep, Verdicts, int]:
     """Solve a window without its new hypotheses, in place; return the step, its verdicts, and the iterations.
 
     Where it moves far and sensors disagree still when judged there, gentle losses may have to lead back. They also follow a sensor that
     is wrong: a compass that is 90 deg off for the whole window bends the gyroscope's bias. So of the solution with them and those
     before, the least costly stays.
     """
+    problem, values, first, known, last, prior = window
 
     def solved(stage: Stage) -> tuple[StretchStep, Verdicts]:
         verdicts = weigh(problem, values, first=first, last=last, stage=stage)

@@ -17,8 +17,9 @@ from graphloc.config import VesselConfig
 from graphloc.frames import Array
 from graphloc.position_jumps import LASTS_S, why_in_doubt
 from graphloc.solution import Cause, Health, HealthReason, SolveStats
-from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
+from graphloc.solve._batch import BatchResult
 from graphloc.solve._decide import AGREES, Verdict
+from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE
 from graphloc.trajectory import Trajectory, bounds_95
 
 # Health: DNV asks for 2.5 m at 95 % in port (Digerud); beyond 25 m a pose helps nobody there.

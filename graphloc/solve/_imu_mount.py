@@ -31,7 +31,7 @@ from graphloc.frames import Array, skew
 from graphloc.recording import Progress
 from graphloc.solve._decide import Stage, Verdicts, weigh
 from graphloc.solve._linearised import linearised, normal_solver, sparse_rows, with_left_out
-from graphloc.solve._passes import Settled, cost_as_configured, settle
+from graphloc.solve._passes import Settled, cost_of_run, settle
 
 _ROUNDS = 3
 _MATTERS, _TOLD = 0.5, 1.5  # sigmas of the mount, and of what is known of it: less is in the bounds
@@ -166,7 +166,7 @@ def with_mount_estimated(
 
     def cost(problem: Problem, settled: Settled, prior: StartPrior) -> float:
         off = problem.imu_turn_rad / sigma
-        return 0.5 * float(off @ off) + cost_as_configured(problem, settled.values, 0, last, prior, judged=last)
+        return 0.5 * float(off @ off) + cost_of_run(problem, settled.values, prior)
 
     def found(problem: Problem, settled: Settled, prior: StartPrior) -> MountError | None:
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of the IMU by the residuals of a solved run: how many times the configured one explains them.
+"""Noise of the IMU by the cost of a solved run, and by its residuals: how many times the configured one explains them.
 
 Values of a data sheet, where engine and hull shake it: the solution then follows the IMU's noise, and is too sure. The cost of the
 whole run hardly shows it, as most of it is of the other sensors.
@@ -34,6 +34,18 @@ _FEWEST = 200  # samples that show how they scatter; how surely, ten times as ma
 _MOST_STEP = 3.0  # that a round changes the noise by
 LEAST_TIMES = 1.5
 """The noise must be so many times as large to be taken."""
+CONTRADICTION = 2.5
+"""Cost over its expectation from which the configured noise is not believed."""
+LARGEST_NOISE_SCALE = 10.0
+"""No IMU is so many times noisier than configured."""
+
+
+def noise_step(ratio: float) -> float:
+    """Return the factor by which the noise is scaled up at once where the cost is `ratio` times its expectation.
+
+    At most by 3: modes and weights are chosen anew before it is looked at again.
+    """
+    return float(np.clip(np.sqrt(ratio), 1.5, 3.0))
 
 
 class ImuMisfit(NamedTuple):

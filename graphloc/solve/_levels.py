@@ -24,7 +24,7 @@ from graphloc.graph import SlowProcess
 from graphloc.position_jumps import MEAN_S
 from graphloc.recording import Progress
 from graphloc.solve._decide import Stage, Verdicts, decisions, weigh
-from graphloc.solve._passes import Settled, cost_as_configured, settle
+from graphloc.solve._passes import Settled, cost_of_run, settle
 from graphloc.time import NS_PER_S
 
 _JUMP = 1.0  # sigmas from one node to the next: ten times the drift
@@ -180,9 +180,7 @@ def _after_outage(
 
 def _total(case: _Case, prior: StartPrior) -> float:
     """Return the cost (nats) of all measurements, and of the time that a receiver is far off."""
-    last = len(case.problem.timeline) - 1
-    cost = cost_as_configured(case.problem, case.settled.values, 0, last, prior, judged=last)
-    return cost + case.cost(_away_cost, np.zeros(3))
+    return cost_of_run(case.problem, case.settled.values, prior) + case.cost(_away_cost, np.zeros(3))
 
 
 def _told_otherwise(problem: Problem, verdicts: Verdicts) -> bool:

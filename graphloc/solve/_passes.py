@@ -190,3 +190,9 @@ def cost_as_configured(
             _, residuals = met(problem, stream, stream.between(first, last), values)
             cost += sum(min(stream.config.kernel.loss(r.nis(), len(r.raw)) for r in found) for found in residuals)
     return cost
+
+
+def cost_of_run(problem: Problem, values: gtsam.Values, prior: StartPrior) -> float:
+    """Return `cost_as_configured` of all states."""
+    last = len(problem.timeline) - 1
+    return cost_as_configured(problem, values, 0, last, prior, judged=last)

@@ -79,7 +79,7 @@ def pairs_of(stream: Judged, judged: Iterable[tuple[Measurement, Residual]]) -> 
         if not scaled or b.stamp_ns - a.stamp_ns > _PAIRED_S * 1e9 or len(before.raw) != len(now.raw):
             continue
         change, error = now.raw - before.raw, _error(stream, b, len(now.raw))
-        stated = np.add(*(r.cov if r.white is None else r.white for r in (before, now)))
+        stated = before.white_cov + now.white_cov
         parts = [(key, axes, np.ix_(axes, axes)) for key, axes in scaled.items()]
         pairs.append(tuple(Step(key, change[axes], stated[part], error[part]) for key, axes, part in parts))
     return pairs

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,38 +42,23 @@ _SHOWN_RAD = np.radians(15.0)  # 1 sigma, somewhere in the run, from which the m
 _TOLD_RAD = np.radians(7.0)  # 1 sigma of a heading of which those 30 deg beside it cost 8 more, as in `_start`
 
 
+class _States(NamedTuple):
+    """The N states of a solved run, with the arrays of a `Solution`."""
+
+    trajectory: Trajectory
+    v_cov: Array
+    accel_bias_mps2: Array
+    gyro_bias_radps: Array
+    gyro_radps: Array
+
+
 def make_solution(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
     """Return what the solver hands over."""
-    n, known = len(problem.timeline), result
+    known = result
     result, unsaid = _without_drift(known)
-    values, tree, slow_of = result.values, result.tree, problem.timeline.slow_of
-    poses = [values.atPose3(keys.pose(k)) for k in range(n)]
-    R = np.array([p.rotation().matrix() for p in poses])
-    bias = [values.atConstantBias(keys.bias(int(j))) for j in slow_of]
-    gyro_bias = np.array([b.gyroscope() for b in bias])
-    raw = result.problem.links.gyro_at(problem.timeline.stamps_ns)
-    gyro = raw - gyro_bias @ result.problem.R_body_imu.T
-    # From the IMU's place to the body's origin.
-    lever = -problem.t_body_imu_m
-    trajectory = Trajectory(
-        stamps_ns=problem.timeline.stamps_ns,
-        p_world_m=np.array([p.transformFrom(lever) for p in poses]),
-        R_world_body=R,
-        v_world_mps=np.array([values.atVector(keys.velocity(k)) for k in range(n)])
-        + np.einsum("nij,nj->ni", R, np.cross(gyro, lever)),
-        cov=np.array([world_covariance(tree.marginalCovariance(keys.pose(k)), R[k], lever) for k in range(n)]),
-    )
-    assert trajectory.cov is not None
-    trajectory.cov[:, :3, :3] += unmodelled_covariance(problem.streams) + result.levels_cov
-    v_cov = np.array([tree.marginalCovariance(keys.velocity(k)) for k in range(n)])
-    guess = _add_others(known, trajectory.cov)
-    unsaid += [
-        *_add_unmodelled(known, trajectory.cov, v_cov),
-        *_add_mount(known, R, trajectory.cov, v_cov),
-        *(guess or _add_guess(known, trajectory.cov)),
-        *_add_doubt(known, trajectory.cov),
-    ]
-    limit_heading(trajectory.cov)
+    states = _states_of(problem, result)
+    unsaid += _widen(known, states)
+    trajectory = states.trajectory
     since = {s.name: since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     stats = stats_of(problem, result)
     stats = replace(stats, warnings=(*stats.warnings, *unsaid), events=mount_event(result.problem))
@@ -82,10 +68,10 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     return Solution(
         datum=problem.datum,
         trajectory=trajectory,
-        v_cov=v_cov,
-        accel_bias_mps2=np.array([b.accelerometer() for b in bias]),
-        gyro_bias_radps=gyro_bias,
-        gyro_radps=gyro,
+        v_cov=states.v_cov,
+        accel_bias_mps2=states.accel_bias_mps2,
+        gyro_bias_radps=states.gyro_bias_radps,
+        gyro_radps=states.gyro_radps,
         health=health,
         health_reason=reasons,
         since_agreed_s=since,
@@ -101,6 +87,50 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
             name: off_m for name, found in corrected.items() if (off_m := antenna_off_m(found)) is not None
         },
     )
+
+
+def _states_of(problem: Problem, result: BatchResult) -> _States:
+    """Return the states, moved from the IMU's place to the body's origin, with the covariance of the graph and of other levels."""
+    states, values, tree = range(len(problem.timeline)), result.values, result.tree
+    poses = [values.atPose3(keys.pose(k)) for k in states]
+    R = np.array([p.rotation().matrix() for p in poses])
+    bias = [values.atConstantBias(keys.bias(int(j))) for j in problem.timeline.slow_of]
+    gyro_bias = np.array([b.gyroscope() for b in bias])
+    raw = result.problem.links.gyro_at(problem.timeline.stamps_ns)
+    gyro = raw - gyro_bias @ result.problem.R_body_imu.T
+    lever = -problem.t_body_imu_m
+    cov = np.array([world_covariance(tree.marginalCovariance(keys.pose(k)), R[k], lever) for k in states])
+    cov[:, :3, :3] += unmodelled_covariance(problem.streams) + result.levels_cov
+    trajectory = Trajectory(
+        stamps_ns=problem.timeline.stamps_ns,
+        p_world_m=np.array([p.transformFrom(lever) for p in poses]),
+        R_world_body=R,
+        v_world_mps=np.array([values.atVector(keys.velocity(k)) for k in states])
+        + np.einsum("nij,nj->ni", R, np.cross(gyro, lever)),
+        cov=cov,
+    )
+    return _States(
+        trajectory=trajectory,
+        v_cov=np.array([tree.marginalCovariance(keys.velocity(k)) for k in states]),
+        accel_bias_mps2=np.array([b.accelerometer() for b in bias]),
+        gyro_bias_radps=gyro_bias,
+        gyro_radps=gyro,
+    )
+
+
+def _widen(result: BatchResult, states: _States) -> list[str]:
+    """Widen the covariances, in place, by what the graph does not know of; return warnings."""
+    cov, v_cov = states.trajectory.cov, states.v_cov
+    assert cov is not None
+    guess = _add_others(result, cov)
+    unsaid = [
+        *_add_unmodelled(result, cov, v_cov),
+        *_add_mount(result, states.trajectory.R_world_body, cov, v_cov),
+        *(guess or _add_guess(result, cov)),
+        *_add_doubt(result, cov),
+    ]
+    limit_heading(cov)
+    return unsaid
 
 
 def _add_doubt(result: BatchResult, cov: Array) -> list[str]:

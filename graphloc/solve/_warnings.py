@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build import CONSTANT_TAILS, Problem, Stream, constant_keys, every_constant, solved_constants
+from graphloc.build import CONSTANT_TAILS, Problem, Stream, solved_constants
 from graphloc.config import SIGMA_SCALES, PoseConfig, SensorConfig
 from graphloc.frames import Array
 from graphloc.graph import TIME_OFFSET, Constant, SlowProcess, corrections
 from graphloc.position_jumps import jump_warnings, largest_sigma
 from graphloc.series import runs
 from graphloc.solution import Graded, SolveStats
-from graphloc.solve._batch import LARGEST_NOISE_SCALE, BatchResult
+from graphloc.solve._batch import BatchResult
 from graphloc.solve._decide import AGREES, Verdict
 from graphloc.solve._health import CONTRADICTING_COST, FAR_OFF, late_of
 from graphloc.solve._imu_mount import MountError, mount_sigma_rad
-from graphloc.solve._imu_noise import too_quiet
+from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE, too_quiet
 from graphloc.solve._lasting import lasting
 from graphloc.solve._passes import expected_cost
 from graphloc.time import stamps_of, utc_text
@@ -183,10 +183,11 @@ def mount_event(problem: Problem) -> tuple[str, ...]:
 def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
     expected = expected_cost(problem, result.verdicts)
     warnings = [*problem.warnings, *_of_the_run(problem, result, expected)]
-    for n, stream in enumerate(problem.streams):
+    there = {stream.number for stream in problem.streams}
+    for stream in problem.streams:
         warnings += _of_a_sensor(stream, result)
-        said = set(every_constant(problem.streams[:n]))
-        warnings += _of_constants(stream, result) if said.isdisjoint(constant_keys(stream)) else []
+        if stream.shares not in there:  # else they are said of the sensor that has the same
+            warnings += _of_constants(stream, result)
     return SolveStats(
         passes=result.passes,
         iterations=result.iterations,

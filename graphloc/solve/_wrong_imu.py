@@ -35,7 +35,7 @@ _WORSE = 6.0  # log-likelihood by which a shorter span may be less probable
 GROWS = 4.0  # times the square of the first residual in a row
 _IN_A_ROW = 3  # measurements of a sensor that disagree make it one that denies
 _SENSORS, _FEWEST = 2, 2  # that agree without the IMU, and with how many measurements more
-_MOTION = 3.0  # sigmas of the motion in a gap (`factors.imu`), once and per second
+_MOTION = 3.0  # sigmas of the motion in a gap, once and per second
 
 
 class ImuWrong(Exception):
@@ -59,6 +59,30 @@ def left_out(recording: Recording, spans: Sequence[tuple[int, int]]) -> tuple[Re
     return replace(recording, imu=imu.where(~wrong), rows=rows), said
 
 
+def most_motion(length_s: float) -> float:
+    """Return the squared motion that a vessel may make in a gap of the IMU, in sigmas of what is expected there (`factors.imu`)."""
+    return _MOTION**2 * (1.0 + length_s)
+
+
+class GrownWindow(NamedTuple):
+    """A window of a run that is grown: states first..last, of which those after `known` are new.
+
+    Attributes:
+        values: estimate of the run, changed in place. prior: what earlier data say of state `first`.
+    """
+
+    problem: Problem
+    values: gtsam.Values
+    first: int
+    known: int
+    last: int
+    prior: StartPrior | Past
+
+    def cost(self) -> float:
+        """Return `cost_as_configured` of the window."""
+        return cost_as_configured(self.problem, self.values, self.first, self.last, self.prior, judged=self.last)
+
+
 class _Found(NamedTuple):
     """A window solved without the IMU between two of its states: the problem, the cost, and the values of its states."""
 
@@ -67,22 +91,14 @@ class _Found(NamedTuple):
     values: gtsam.Values
 
 
-def wrong_span(
-    problem: Problem,
-    values: gtsam.Values,
-    first: int,
-    known: int,
-    last: int,
-    prior: StartPrior | Past,
-    before: gtsam.Values,
-    solve: Callable[[Problem], None],
-) -> tuple[int, int] | None:
-    """Return where the IMU is wrong in a window that has been solved, states first..last: after one stamp until another (ns); None: it is not.
+def wrong_span(window: GrownWindow, before: gtsam.Values, solve: Callable[[Problem], object]) -> tuple[int, int] | None:
+    """Return where the IMU is wrong in a window that has been solved: after one stamp until another (ns); None: it is not.
 
     Args:
-        values: in place; at the end as without it there. known: the last state of the window before.
-        before: its states up to there, as solved without what is new. solve: solves the window of a problem, in place.
+        window: at the end its values are those without the IMU there.
+        before: its states up to `known`, as solved without what is new. solve: solves the window of a problem, in place.
     """
+    problem, values, first, known, last, _ = window
     begin = max(first + 1, problem.timeline.floor(int(problem.timeline.stamps_ns[known] - _BEFORE_S * NS_PER_S)))
     agreed, squares = _agreeing(problem, values, begin, last)
     if not _contradicted(problem, values, first, begin, last) and sum(map(_denies, agreed)) < _SENSORS:
@@ -90,42 +106,68 @@ def wrong_span(
     denying = [n for n, each in enumerate(agreed) if _denies(each)]
     if denying and not any(_grows(agreed[n], squares[n]) for n in denying):
         return None
-    as_is = copy_states(problem, values, first, last)
-    cost = cost_as_configured(problem, values, first, last, prior, judged=last)
+    trials = _Trials(window, before, solve, begin, agreed)
+    span, kept = None, trials.as_is
+    try:
+        if trials.explains(begin, last, whole := trials.without(begin, last)):
+            (a, b), found = _shortest(trials.without, begin, last, whole)
+            if trials.explains(a, b, found):
+                span = int(problem.timeline.stamps_ns[a]), int(problem.timeline.stamps_ns[b])
+                kept = found.values
+    except SolveError:
+        pass  # the window stands as it is
+    values.update(kept)
+    return span
 
-    def without(a: int, b: int) -> _Found:
-        # Not from the window as solved, whose biases may be bent as far back as it reaches.
-        values.update(as_is)
-        values.update(before)
+
+class _Trials:
+    """Solutions of a window without the IMU in parts of it; other arguments as of `wrong_span`.
+
+    Args:
+        begin: the first state from which it may be wrong. agreed: of each stream, which measurements since agree with the window as it is.
+
+    Attributes:
+        as_is: the states of the window as it is.
+    """
+
+    def __init__(
+        self,
+        window: GrownWindow,
+        before: gtsam.Values,
+        solve: Callable[[Problem], object],
+        begin: int,
+        agreed: Sequence[NDArray[np.bool_]],
+    ) -> None:
+        self._window, self._before, self._solve, self._begin, self._agreed = window, before, solve, begin, agreed
+        self.as_is = copy_states(window.problem, window.values, window.first, window.last)
+        self._cost = window.cost()
+
+    def without(self, a: int, b: int) -> _Found:
+        """Solve the window without the IMU from state `a` to `b`, in place.
+
+        Not from the window as solved, whose biases may be bent as far back as it reaches.
+        """
+        problem, values, first, known, last, _ = self._window
+        values.update(self.as_is)
+        values.update(self._before)
         stamps_ns = problem.timeline.stamps_ns
         dead_reckon(problem, values, known, max(a, known))
         rest = without_imu(problem, values, int(stamps_ns[a]), int(stamps_ns[b]))
         dead_reckon(rest, values, a, last)
-        solve(rest)
-        found = cost_as_configured(rest, values, first, last, prior, judged=last) + _PRICE * (b - a)
-        return _Found(rest, found, copy_states(rest, values, first, last))
+        self._solve(rest)
+        cost = self._window._replace(problem=rest).cost() + _PRICE * (b - a)
+        return _Found(rest, cost, copy_states(rest, values, first, last))
 
-    def explains(a: int, b: int, found: _Found) -> bool:
+    def explains(self, a: int, b: int, found: _Found) -> bool:
         """Whether it is clearly more probable, by several sensors and a motion that a vessel may make."""
-        if found.cost > cost - _CLEARLY:
+        if found.cost > self._cost - _CLEARLY:
             return False
-        stamps_ns = problem.timeline.stamps_ns
+        stamps_ns = found.problem.timeline.stamps_ns
         moved = sum(2.0 * found.problem.inertial[k].error(found.values) for k in range(a, b))
-        may = _MOTION**2 * (1.0 + (stamps_ns[b] - stamps_ns[a]) / NS_PER_S)
-        pairs = zip(_agreeing(found.problem, found.values, begin, last)[0], agreed, strict=True)
+        may = most_motion(float(stamps_ns[b] - stamps_ns[a]) / NS_PER_S)
+        agree, _ = _agreeing(found.problem, found.values, self._begin, self._window.last)
+        pairs = zip(agree, self._agreed, strict=True)
         return bool(moved <= may and sum(now.sum() - before.sum() >= _FEWEST for now, before in pairs) >= _SENSORS)
-
-    span = None
-    try:
-        if explains(begin, last, whole := without(begin, last)):
-            (a, b), found = _shortest(without, begin, last, whole)
-            if explains(a, b, found):
-                span = int(problem.timeline.stamps_ns[a]), int(problem.timeline.stamps_ns[b])
-                as_is = found.values
-    except SolveError:
-        pass  # the window stands as it is
-    values.update(as_is)
-    return span
 
 
 def _contradicted(problem: Problem, values: gtsam.Values, first: int, begin: int, last: int) -> bool:
