@@ -860,6 +860,35 @@ def test_a_receiver_without_a_message_and_damaged_transforms_are_reported(tmp_pa
     assert any(w == "/fix: not a message on it" for w in found.warnings)
 
 
+@pytest.mark.parametrize("frame", ["map grid", "earth-centred"])
+def test_an_ins_that_tells_its_speed_is_no_wheels(frame: str, tmp_path: Path) -> None:
+    """In UTM without a fix it is the receiver, and then checks no speed, which `smooth` refused; from the earth's centre it is none."""
+    make = Messages(2)
+    driven = drive(make)
+    items = [item for item in driven if item[0] in ("/imu", "/compass") or (item[0] == "/fix" and frame != "map grid")]
+    rolled = [(at_ns, m.twist.twist.linear.x) for topic, at_ns, m in driven if topic == "/wheel/odom"]
+    at_ns, speeds = (np.array(v, dtype=float) for v in zip(*rolled, strict=True))
+    for _, log_ns, fix in [item for item in driven if item[0] == "/fix"]:
+        lla = np.array([fix.latitude]), np.array([fix.longitude]), np.array([fix.altitude])
+        enu = DATUM.enu_from_geodetic(*lla)[0]
+        off_m = (EASTING, NORTHING, 0.0) if frame == "map grid" else (3.3e6, 0.7e6, 5.4e6)
+        stamp = fix.header.stamp.sec * S + fix.header.stamp.nanosec
+        v = (float(np.interp(stamp, at_ns, speeds)), 0.0, 0.0)
+        items.append(("/applanix/pose", log_ns, make.odometry(stamp, (enu + off_m).tolist(), v=v)))
+    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    (item,) = found.odometry
+    assert item.fused
+    assert f"its frame is {'a map grid' if frame == 'map grid' else frame}, which no wheels know" in item.why
+    assert "wheels" not in config.sensors
+    if frame == "map grid":
+        assert "as an INS or a filter does" in text
+        assert "not fused" not in text
+        (tmp_path / "vessel.yaml").write_text(text.replace("grid: ''", "grid: EPSG:32632"))
+        assert (
+            len(read_recording(tmp_path / "run", load_config(tmp_path / "vessel.yaml", KINDS)).of(GnssPosition)) > 100
+        )
+
+
 def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
     make = Messages(2)
     items: list[Item] = []
