@@ -31,7 +31,7 @@ from graphloc.frontends._assess import (
     without_drift,
 )
 from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
-from graphloc.frontends._assess_imu import felt_of, imu_report, series_of
+from graphloc.frontends._assess_imu import felt_of, imu_report, series_of, turned_as_its_heading
 from graphloc.frontends._assess_receivers import apart, apart_warning, height_wanders_m
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_wander import changes, way_of
@@ -207,8 +207,10 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     down = _looks_down(bag, imus, gnss)
     imus = [_in_turned_body(imu) for imu in imus] if down else imus
     felt = felt_of(bag.aligned[imus[0].topic], imus[0], tree, body) if imus else None
-    late = {motion.source: motion_time_offset(felt, motion) for motion in motions} if felt else {}
     compasses = _compass_reports(bag, imus, felt.turning if felt else None, courses)
+    imus = [turned_as_its_heading(imu, compasses) for imu in imus]
+    felt = felt_of(bag.aligned[imus[0].topic], imus[0], tree, body) if imus else None
+    late = {motion.source: motion_time_offset(felt, motion) for motion in motions} if felt else {}
     used = {g.topic for g in gnss} | {i.topic for i in imus} | {c.topic for c in compasses if c.usable}
     reports = [report for _, report in odometry]
     doppler = {v.topic for _, v in velocities if v.axes in (EAST_AXES, NORTH_AXES) and not filtered(v.topic)}

@@ -40,6 +40,9 @@ EASTING, NORTHING = 672816.3225, 6399009.0284  # of DATUM, by the series itself,
 ROLL_90 = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # takes the sensor's y to body z
 
 
+CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # z ahead, x to starboard, y down
+
+
 def drive(
     make: Messages,
     R_body_sensor: Any = None,
@@ -887,6 +890,36 @@ def test_an_ins_that_tells_its_speed_is_no_wheels(frame: str, tmp_path: Path) ->
         assert (
             len(read_recording(tmp_path / "run", load_config(tmp_path / "vessel.yaml", KINDS)).of(GnssPosition)) > 100
         )
+
+
+@pytest.mark.parametrize("turned", [True, False], ids=["half a turn", "a quarter turn"])
+def test_an_imu_that_no_motion_turns_is_turned_as_its_own_heading(turned: bool, tmp_path: Path) -> None:
+    """Hand-held, by a gait that hides what turns feel like: taken as ahead, the solved heading was 177 deg off."""
+    make, offset = Messages(2), np.pi if turned else np.pi / 2.0
+    driven, rng = drive(make, R_body_sensor=rotation_z(180.0)), np.random.default_rng(2)
+    headings = [(at, m.quaternion) for topic, at, m in driven if topic == "/compass"]
+    stamps = np.array([at for at, _ in headings])
+    yaws = np.pi / 2.0 - np.unwrap([2.0 * np.arctan2(q.z, q.w) for _, q in headings])  # of headings from north
+    items = [item for item in driven if item[0] == "/fix"]
+    for _, at, m in (item for item in driven if item[0] == "/imu"):
+        half = 0.5 * (float(np.interp(at, stamps, yaws)) + offset)
+        m.orientation.z, m.orientation.w = np.sin(half), np.cos(half)
+        m.orientation_covariance[0] = 0.01
+        m.linear_acceleration.x, m.linear_acceleration.y = rng.normal(size=2)
+        items.append(("/imu", at, m))
+    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert "does not show its yaw" in found.imus[0].mount.evidence
+    assert config.sensors["imu"].mount.rpy_deg == (0.0, 0.0, 180.0 if turned else 0.0)
+    assert ("as its orientation is" in text) is turned
+
+
+def test_an_imu_whose_y_is_down_looks_along_z_where_nothing_tells(tmp_path: Path) -> None:
+    """The axes of a camera: taken with x ahead, the heading was a quarter turn off."""
+    make = Messages(2)
+    items = [item for item in drive(make, R_body_sensor=CAMERA) if item[0] == "/imu"]
+    _, config, text = look(tmp_path, items, make)
+    assert config.sensors["imu"].mount.rpy_deg == (-90.0, 0.0, -90.0)
+    assert "as in a camera's axes" in text
 
 
 def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
