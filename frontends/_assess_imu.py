@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2
-from graphloc.frames import Array, rpy_from_rotation, wrap_angle
+from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, wrap_angle
 from graphloc.frontends import _clock
 from graphloc.frontends._assess import Courses, MeasuredMotion, vec
 from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
-from graphloc.frontends._reports import ImuReport, MountGuess
+from graphloc.frontends._reports import CompassReport, ImuReport, MountGuess
 from graphloc.frontends._sanity import (
     HALF,
     NEVER_STILL_RADPS,
@@ -46,6 +46,7 @@ _QUIET_S, _STANDS_S = 2, 1.5
 _TILTED_DEG, _QUARTER_DEG, _OVERRULES = 20.0, 20.0, 0.6
 _SLIGHTLY_DEG = 3.0  # off a quarter turn, from which it is said
 _ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, or an antenna far ahead, make less
+_CAMERA = -0.7  # of gravity along y, below which its axes are a camera's
 _ON_ITS_HEAD = -0.7  # of gravity along z, below which a sensor is so, however it is tilted
 
 
@@ -132,9 +133,28 @@ def _turned(
 ) -> MountGuess:
     """Return the mount of a sensor that `level` (3, 3) levels, aligned with the motion; `said`: why it is known."""
     yaw, evidence = _mount_yaw(imu, accel @ level.T, gyro @ level.T, motions)
+    told = yaw is not None
+    if yaw is None:
+        ahead = level[:, 2] if level[2, 1] < _CAMERA else np.array([1.0, 0.0, 0.0])
+        yaw = float(np.degrees(np.arctan2(-ahead[1], ahead[0]))) + 0.0
+        evidence += f": taken as {yaw:.0f}" + ("" if yaw == 0.0 else ", z ahead and y down as in a camera's axes")
     turn = Rotation.from_euler("z", yaw, degrees=True).as_matrix()
     rpy = vec(np.round(np.degrees(rpy_from_rotation(turn @ level)), 1) + 0.0)
-    return MountGuess(rpy_deg=rpy, tf_frame=None, evidence=f"{said}; {evidence}")
+    return MountGuess(rpy_deg=rpy, tf_frame=None, evidence=f"{said}; {evidence}", yaw_told=told)
+
+
+def turned_as_its_heading(imu: ImuReport, compasses: Sequence[CompassReport]) -> ImuReport:
+    """Return the report with the mount turned by half where nothing tells its yaw, but its own orientation is half a turn off the course.
+
+    Not by a quarter turn: headings from north, or in other axes than the driver names, are off by that as well.
+    """
+    own = next((c for c in compasses if c.topic == imu.topic and c.backwards), None)
+    if own is None or own.offset_deg is None or imu.mount.yaw_told:
+        return imu
+    R = np.diag([-1.0, -1.0, 1.0]) @ rotation_from_rpy_deg(np.array(imu.mount.rpy_deg))
+    rpy = vec(np.round(np.degrees(rpy_from_rotation(R)), 1) + 0.0)
+    said = f"{imu.mount.evidence}, but half a turn off that, as its orientation is {own.offset_deg:+.0f} deg off the GNSS course"
+    return replace(imu, mount=replace(imu.mount, rpy_deg=rpy, evidence=said, yaw_told=True))
 
 
 def _level(axis: Array) -> Array:
@@ -152,24 +172,25 @@ def _level(axis: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(angle * cross / sine).as_matrix() @ turned)
 
 
-def _mount_yaw(imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion]) -> tuple[float, str]:
-    """Return the yaw (deg) that fits the motion, with the evidence; `accel`, `gyro` are levelled.
+def _mount_yaw(
+    imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion]
+) -> tuple[float | None, str]:
+    """Return the yaw (deg) that fits the motion, None where nothing tells it, with the evidence; `accel`, `gyro` are levelled.
 
     It is a multiple of 90 deg unless the motion clearly contradicts that.
     """
     if not motions:
-        return 0.0, "no motion to find its yaw from: taken as 0"
+        return None, "no motion to find its yaw from"
     found = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], accel, gyro, motions)
     if found is None:
-        return 0.0, "too little motion to find its yaw from: taken as 0"
+        return None, "too little motion to find its yaw from"
     quarter = 90.0 * round(found.yaw_deg / 90.0)
     if not found.clear and found.likely:
         yaw = float(np.degrees(wrap_angle(np.radians(quarter)))) + 0.0
         said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg, but not clearly (coherence {found.coherence:.2f})"
         return yaw, f"{said}: taken as {yaw:.0f}"
     if not found.clear:
-        said = f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
-        return 0.0, f"{said}: taken as 0"
+        return None, f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
     askew = abs(found.yaw_deg - quarter) > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
     yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter)))) + 0.0
     said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"

@@ -224,8 +224,8 @@ def _fused(topic: str, world: World) -> str:
         return "a filter's output by its name"
     if _INS.search(topic):
         return "an INS's output by its name"
-    if world.grid or world.origin is not None:
-        frame = "a map grid" if world.grid else "east-north-up about the fixes"
+    if world.grid or world.centred or world.origin is not None:
+        frame = "a map grid" if world.grid else "earth-centred" if world.centred else "east-north-up about the fixes"
         return f"an INS's or a filter's output, as its frame is {frame}, which no wheels know"
     return ""
 

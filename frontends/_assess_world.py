@@ -27,13 +27,14 @@ class World(NamedTuple):
     """Frame of poses: its origin, None if it is not east-north-up or unknown; the evidence in words.
 
     `pose`: whether they may be poses of the vessel about a datum, neither in a map grid nor of something else. `grid`: whether they are as
-    large as in a map grid.
+    large as in a map grid. `centred`: whether they are as large as from the earth's centre.
     """
 
     origin: Vec | None
     why: str
     pose: bool = True
     grid: bool = False
+    centred: bool = False
 
 
 def in_map_grid(poses: TopicData) -> bool:
@@ -62,7 +63,8 @@ def world_of(
     if away_m > _FAR_M:
         grid = in_map_grid(poses)
         kind = "a map grid (UTM)" if grid else "earth-centred axes, which are not read"
-        return World(None, f"it is {away_m / 1e3:.0f} km from its origin: looks like {kind}", pose=False, grid=grid)
+        said = f"it is {away_m / 1e3:.0f} km from its origin: looks like {kind}"
+        return World(None, said, pose=False, grid=grid, centred=not grid)
     if first_fix is None or len(keep) < 10 or len(stamps_ns) < 10:
         return World(None, "no GNSS track to check its frame against")
     at, q = poses.stamps_ns[keep], poses.rows[keep, :3]

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -48,6 +48,7 @@ _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off:
 # For how long the error of a float or single fix stays the same: from where RTK was, its growth is the bound.
 _FLOAT_S = 60.0
 _FILTERED = "by its name, or its messages, a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
+_INS = "it tells its speed, as an INS or a filter does: the IMU is in it already, and its error is slow, so that it is believed too much"
 _MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; drivers may publish each packet
 _TURN_S = 0.1
 _MOST_PARTS = 100  # of a submap
@@ -68,7 +69,7 @@ def draft_config(inspection: Inspection) -> str:
     ]
     blocks = [with_clock(_in_body(block, inspection), inspection) for block in _blocks(inspection)]
     lines += [f"  {line}" for block in blocks for line in block]
-    lines += _beside(inspection.odometry)
+    lines += _beside([o for o in inspection.odometry if o not in _in_a_grid(inspection)])
     return "\n".join(lines) + "\n"
 
 
@@ -95,7 +96,8 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     for compass in (c for c in inspection.compasses if not c.usable):
         yield [f"# orientation of {compass.topic}: left out as a compass; {compass.why}"]
     yield from _velocities(inspection)
-    speeds = [o for o in inspection.odometry if o.role == "check_speed"]
+    in_a_grid = _in_a_grid(inspection)
+    speeds = [o for o in inspection.odometry if o.role == "check_speed" and o not in in_a_grid]
     wheels = [o for o in speeds if not o.fused]
     for item in (o for o in speeds if o.fused):
         yield [
@@ -111,7 +113,6 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
             "  enabled: false  # guess: true if its frame is east-north-up at the datum and no fix went into it",
             "  # slow_error: {sigma_m: 1.0, time_constant_s: 60}  # where errors last (USBL, UWB, a filter's output); else they count as independent",
         ]
-    in_a_grid = _in_a_grid(inspection)
     for item in (o for o in inspection.odometry if o.role == "other" and o not in in_a_grid):
         instead = ": take the receiver's NavSatFix" if inspection.gnss and item.grid else ""
         yield [f"# {item.topic}: left out, {item.world}{instead}"]
@@ -155,6 +156,7 @@ def _in_a_grid(inspection: Inspection) -> list[OdometryReport]:
 def _grid_block(name: str, item: OdometryReport, *, enabled: bool) -> list[str]:
     lines = [f"{name}:", "  kind: gnss", f"  topic: {item.topic}"]
     lines += [] if enabled else ["  enabled: false  # guess: one receiver is used"]
+    lines += [f"  # guess: {_INS}"] if item.role == "check_speed" else []
     zone = "EPSG:32632 for UTM zone 32 north, EPSG:32732 for zone 32 south"
     return [
         *lines,
@@ -588,7 +590,7 @@ def _datum_line(inspection: Inspection) -> str:
     return "# datum: the median of the first five fixes"
 
 
-def _beside(odometry: tuple[OdometryReport, ...]) -> list[str]:
+def _beside(odometry: Sequence[OdometryReport]) -> list[str]:
     lines = []
     truths = [o for o in odometry if o.role == "truth"]
     for k, item in enumerate(sorted(truths, key=lambda o: o.origin is None)):

@@ -27,6 +27,7 @@ FEWEST, MOVES_M = 20, 1.0  # windows; a shorter way has no direction
 _MIN_COHERENCE, _CLEAR = 0.25, 4.0  # and so many times what chance gives
 _LIKELY_COHERENCE, _LIKELY = 0.5, 3.0  # the same, to choose between quarter turns: chance gives it once in 8000
 _WAVES_S = 20.0  # the longest that tilt it
+_NEARLY = 0.9  # as long as from one measurement to the next, whose stamps may be uneven
 _ASTRAY_DEG = 30.0  # leeway, or an antenna far ahead, make less
 
 
@@ -120,8 +121,17 @@ def yaw_in_craft(
         stamps_ns: (N,), increasing. accel, gyro: (N, 3) m/s^2, rad/s, levelled.
     """
     felt = Felt.of(stamps_ns, accel, gyro)
-    tried = [found for motion in motions for half_s in HALF_S if (found := _yaw_by(felt, motion, half_s))]
+    tried = [found for motion in motions for half_s in windows_of(motion) if (found := _yaw_by(felt, motion, half_s))]
     return max(tried, key=lambda found: found.coherence / found.chance, default=None)
+
+
+def windows_of(motion: MeasuredMotion) -> tuple[float, ...]:
+    """Return half the times, s, over which a motion is asked for its acceleration: none shorter than from one measurement to the next.
+
+    Between these it is a straight line, which has no acceleration; asked there, few windows count as many, and what they say as clear.
+    """
+    apart_s = float(np.median(np.diff(motion.t_s))) if len(motion.t_s) > 1 else 0.0
+    return tuple(half_s for half_s in HALF_S if half_s >= _NEARLY * apart_s) or (apart_s,)
 
 
 def _yaw_by(felt: Felt, motion: MeasuredMotion, half_s: float) -> YawInCraft | None:

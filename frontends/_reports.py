@@ -77,12 +77,16 @@ class TopicReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MountGuess:
-    """Rotation of a sensor in body, deg, or the frame of tf that knows it; and the evidence. `xyz_m`: its place, where known."""
+    """Rotation of a sensor in body, deg, or the frame of tf that knows it; and the evidence.
+
+    `xyz_m`: its place, where known. `yaw_told`: whether anything tells its yaw.
+    """
 
     rpy_deg: Vec
     tf_frame: str | None
     evidence: str
     xyz_m: Vec | None = None
+    yaw_told: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

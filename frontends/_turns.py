@@ -323,7 +323,10 @@ def _said(headings: Sequence[CompassHeading]) -> Yaws:
 def _blocks(
     imu: ImuSeries, yaws: Yaws, block_s: float = _BLOCK_S
 ) -> Iterator[tuple[NDArray[np.intp], Array, Array, Array]]:
-    """Yield for each block without an IMU gap: indices into `yaws`, turn by the gyroscope, yaw, and time (s)."""
+    """Yield for each block without an IMU gap: indices into `yaws`, turn by the gyroscope, yaw, and time (s), increasing.
+
+    Of yaws with one stamp (a clock that was set back by whole seconds) the first is taken.
+    """
     up = np.median(imu.accel_mps2, axis=0) if len(imu.stamps_ns) else np.zeros(3)
     if float(np.linalg.norm(up)) < 5.0 or len(yaws[0]) < 20:  # m/s^2: no gravity in it
         return
@@ -332,6 +335,7 @@ def _blocks(
     holes: NDArray[np.intp] = np.flatnonzero(np.diff(t) > _HOLE_S)
     stamps, yaw = yaws
     order = np.argsort(stamps, kind="stable")
+    order = order[np.diff(stamps[order], prepend=stamps[order[0]] - 1) > 0]
     at = (stamps[order] - imu.stamps_ns[0]) / NS_PER_S
     yaw = yaw[order]
     # A block ends where the next hole begins, and after `block_s`.

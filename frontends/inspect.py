@@ -31,7 +31,7 @@ from graphloc.frontends._assess import (
     without_drift,
 )
 from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
-from graphloc.frontends._assess_imu import felt_of, imu_report, series_of
+from graphloc.frontends._assess_imu import felt_of, imu_report, series_of, turned_as_its_heading
 from graphloc.frontends._assess_receivers import apart, apart_warning, height_wanders_m
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_wander import changes, way_of
@@ -207,8 +207,10 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     down = _looks_down(bag, imus, gnss)
     imus = [_in_turned_body(imu) for imu in imus] if down else imus
     felt = felt_of(bag.aligned[imus[0].topic], imus[0], tree, body) if imus else None
-    late = {motion.source: motion_time_offset(felt, motion) for motion in motions} if felt else {}
     compasses = _compass_reports(bag, imus, felt.turning if felt else None, courses)
+    imus = [turned_as_its_heading(imu, compasses) for imu in imus]
+    felt = felt_of(bag.aligned[imus[0].topic], imus[0], tree, body) if imus else None
+    late = {motion.source: motion_time_offset(felt, motion) for motion in motions} if felt else {}
     used = {g.topic for g in gnss} | {i.topic for i in imus} | {c.topic for c in compasses if c.usable}
     reports = [report for _, report in odometry]
     doppler = {v.topic for _, v in velocities if v.axes in (EAST_AXES, NORTH_AXES) and not filtered(v.topic)}
@@ -289,13 +291,14 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
     rivals = [r for r in found if r.spans_s >= _COVERS * longest_s and not filtered(r.topic)]
     most = max((r.fixes for r in rivals), default=0)
     level_m = min((m for r in rivals if (m := height_wanders_m(r)) is not None), default=0.0)
+    heights_m = {_receiver(r.topic): m for r in found if (m := height_wanders_m(r)) is not None}
     claimed = any(r.reported_sigma_m for r in rivals)
     found.sort(
         key=lambda r: (
             filtered(r.topic),
             r.spans_s < _COVERS * longest_s,
             r.slow_error,
-            _octave(r, level_m if r in rivals else math.inf, claimed=claimed),
+            _octave(r, heights_m.get(_receiver(r.topic)), level_m if r in rivals else math.inf, claimed=claimed),
             r.fixes < _COVERS * most,
             r.without_height == r.fixes,
             -r.fixes,
@@ -305,16 +308,22 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
     return [_beside_others(report, rivals, bag) for report in found]
 
 
-def _octave(gnss: GnssReport, level_m: float, *, claimed: bool) -> int:
+def _receiver(topic: str) -> str:
+    """Return the receiver of a stream of fixes: of NMEA the talker on its topic, whose sentences tell one position, with a height or without."""
+    name, _, sentence = topic.partition(" ")
+    return f"{name} {sentence[:2]}" if sentence else name
+
+
+def _octave(gnss: GnssReport, wanders_m: float | None, level_m: float, *, claimed: bool) -> int:
     """Return how large the fixes' error is by what they claim, or scatter or drift by, in powers of two: closer ones are taken for equal.
 
     Args:
+        wanders_m: by how much the receiver's height wanders, 1 sigma; None where it tells none.
         level_m: by how much the heights of that receiver wander whose heights wander least, 1 sigma. All ride on one craft: what others
             wander by far beyond it is their drift, and the horizontal one is half of the vertical. Up to that it may be hills, which
             receivers smooth.
         claimed: whether one of the receivers claims anything; where none does, their heights alone compare them.
     """
-    wanders_m = height_wanders_m(gnss)
     drift_m = 0.5 * wanders_m if wanders_m is not None and wanders_m > _FAR_BEYOND * level_m else 0.0
     if gnss.reported_sigma_m:
         taken_m = max(gnss.reported_sigma_m[:2])

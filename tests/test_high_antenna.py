@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from graphloc.frontends._assess import MeasuredMotion
 from graphloc.frontends._mount_yaw import Felt
@@ -42,3 +43,22 @@ def test_a_delay_is_told_apart_from_waves(late_s: float, height_m: float, way: f
     assert offset is not None
     assert offset.clear == (late_s > 0.0)
     assert offset.value_s == pytest.approx(-late_s, abs=max(3.0 * offset.sigma_s, 0.03))
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_fixes_once_a_second_are_not_asked_in_between(seed: int) -> None:
+    """A robot on rough ground. Between fixes its track is a straight line; asked there, they looked late by up to ten sigmas."""
+    rng, t = np.random.default_rng(seed), np.arange(0.0, 300.0, 0.01)
+    speed = gaussian_filter1d(np.repeat(rng.uniform(0.3, 1.0, 60) * 1.2, 500), 60.0)
+    pitch = gaussian_filter1d(rng.normal(size=len(t)), 25.0)
+    pitch *= 0.014 / pitch.std()
+    place, zero = np.cumsum(speed) * 0.01, np.zeros(len(t))
+    accel = np.column_stack([np.gradient(speed, 0.01) - G * np.sin(pitch), zero, zero + G])
+    gyro = np.column_stack([zero, np.gradient(pitch, 0.01), zero])
+    noise_a, noise_w = 0.1 * rng.normal(size=(len(t), 3)), 0.003 * rng.normal(size=(len(t), 3))
+    felt = Felt.of((t * 1e9).astype(np.int64), accel + noise_a, gyro + noise_w, G)
+    at = np.arange(0.3, 299.0, 1.0)
+    measured = np.interp(at, t, place) + 0.02 * rng.normal(size=len(at))
+    offset = motion_time_offset(felt, MeasuredMotion("fixes", 0, at, np.full(len(at), 1.0), measured + 0j))
+    assert offset is not None
+    assert abs(offset.value_s) < 3.0 * offset.sigma_s

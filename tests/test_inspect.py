@@ -40,6 +40,9 @@ EASTING, NORTHING = 672816.3225, 6399009.0284  # of DATUM, by the series itself,
 ROLL_90 = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # takes the sensor's y to body z
 
 
+CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # z ahead, x to starboard, y down
+
+
 def drive(
     make: Messages,
     R_body_sensor: Any = None,
@@ -858,6 +861,65 @@ def test_a_receiver_without_a_message_and_damaged_transforms_are_reported(tmp_pa
     assert found.tf_frames == ("base_link", "gps")
     assert "/tf_static: messages that cannot be decoded: 1" in found.warnings
     assert any(w == "/fix: not a message on it" for w in found.warnings)
+
+
+@pytest.mark.parametrize("frame", ["map grid", "earth-centred"])
+def test_an_ins_that_tells_its_speed_is_no_wheels(frame: str, tmp_path: Path) -> None:
+    """In UTM without a fix it is the receiver, and then checks no speed, which `smooth` refused; from the earth's centre it is none."""
+    make = Messages(2)
+    driven = drive(make)
+    items = [item for item in driven if item[0] in ("/imu", "/compass") or (item[0] == "/fix" and frame != "map grid")]
+    rolled = [(at_ns, m.twist.twist.linear.x) for topic, at_ns, m in driven if topic == "/wheel/odom"]
+    at_ns, speeds = (np.array(v, dtype=float) for v in zip(*rolled, strict=True))
+    for _, log_ns, fix in [item for item in driven if item[0] == "/fix"]:
+        lla = np.array([fix.latitude]), np.array([fix.longitude]), np.array([fix.altitude])
+        enu = DATUM.enu_from_geodetic(*lla)[0]
+        off_m = (EASTING, NORTHING, 0.0) if frame == "map grid" else (3.3e6, 0.7e6, 5.4e6)
+        stamp = fix.header.stamp.sec * S + fix.header.stamp.nanosec
+        v = (float(np.interp(stamp, at_ns, speeds)), 0.0, 0.0)
+        items.append(("/applanix/pose", log_ns, make.odometry(stamp, (enu + off_m).tolist(), v=v)))
+    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    (item,) = found.odometry
+    assert item.fused
+    assert f"its frame is {'a map grid' if frame == 'map grid' else frame}, which no wheels know" in item.why
+    assert "wheels" not in config.sensors
+    if frame == "map grid":
+        assert "as an INS or a filter does" in text
+        assert "not fused" not in text
+        (tmp_path / "vessel.yaml").write_text(text.replace("grid: ''", "grid: EPSG:32632"))
+        assert (
+            len(read_recording(tmp_path / "run", load_config(tmp_path / "vessel.yaml", KINDS)).of(GnssPosition)) > 100
+        )
+
+
+@pytest.mark.parametrize("turned", [True, False], ids=["half a turn", "a quarter turn"])
+def test_an_imu_that_no_motion_turns_is_turned_as_its_own_heading(turned: bool, tmp_path: Path) -> None:
+    """Hand-held, by a gait that hides what turns feel like: taken as ahead, the solved heading was 177 deg off."""
+    make, offset = Messages(2), np.pi if turned else np.pi / 2.0
+    driven, rng = drive(make, R_body_sensor=rotation_z(180.0)), np.random.default_rng(2)
+    headings = [(at, m.quaternion) for topic, at, m in driven if topic == "/compass"]
+    stamps = np.array([at for at, _ in headings])
+    yaws = np.pi / 2.0 - np.unwrap([2.0 * np.arctan2(q.z, q.w) for _, q in headings])  # of headings from north
+    items = [item for item in driven if item[0] == "/fix"]
+    for _, at, m in (item for item in driven if item[0] == "/imu"):
+        half = 0.5 * (float(np.interp(at, stamps, yaws)) + offset)
+        m.orientation.z, m.orientation.w = np.sin(half), np.cos(half)
+        m.orientation_covariance[0] = 0.01
+        m.linear_acceleration.x, m.linear_acceleration.y = rng.normal(size=2)
+        items.append(("/imu", at, m))
+    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert "does not show its yaw" in found.imus[0].mount.evidence
+    assert config.sensors["imu"].mount.rpy_deg == (0.0, 0.0, 180.0 if turned else 0.0)
+    assert ("as its orientation is" in text) is turned
+
+
+def test_an_imu_whose_y_is_down_looks_along_z_where_nothing_tells(tmp_path: Path) -> None:
+    """The axes of a camera: taken with x ahead, the heading was a quarter turn off."""
+    make = Messages(2)
+    items = [item for item in drive(make, R_body_sensor=CAMERA) if item[0] == "/imu"]
+    _, config, text = look(tmp_path, items, make)
+    assert config.sensors["imu"].mount.rpy_deg == (-90.0, 0.0, -90.0)
+    assert "as in a camera's axes" in text
 
 
 def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:

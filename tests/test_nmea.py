@@ -400,6 +400,21 @@ def test_the_curvature_of_the_earth_is_no_height(height_m: float | None, tmp_pat
     assert len(scatter.split()) == (9 if height_m else 8)
 
 
+def test_a_height_that_drifts_is_no_reason_to_take_the_sentence_without_one(tmp_path: Path) -> None:
+    """In a street canyon: GGA and RMC say one position, but GGA that it is bad, by its DOP, and how high it is."""
+
+    def bodies(k: int) -> list[str]:
+        place, height_m = ahead(k, 5.0), 10.0 + 60.0 * np.sin(k / 20.0)
+        return [
+            f"GNRMC,120000.00,A,{place},{5.0 / nmea.KNOT_MPS:.3f},0.0,141123,,,A",
+            f"GNGGA,120000.00,{place},1,09,0.9,{height_m:.1f},M,30.0,M,,",
+        ]
+
+    bag, drafted = lines_bag(tmp_path / "run", bodies, 100, S), tmp_path / "vessel.yaml"
+    drafted.write_text(draft_config(inspect_bag(bag)))
+    assert load_config(drafted, KINDS).of_kind("gnss")["gnss"].nmea == ("GNGGA",)
+
+
 @pytest.mark.parametrize("hz", [1, 10])
 def test_a_receiver_that_changes_its_talker_is_one(hz: int, tmp_path: Path) -> None:
     """GP where it sees GPS satellites alone, GN with others: of the draft, which named one talker, half of the fixes were left."""

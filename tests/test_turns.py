@@ -163,6 +163,15 @@ def test_waves_are_no_wander(wander_deg_: float, low: float, high: float) -> Non
     assert turn_warnings(imu, "compass", headings, "enu") == []
 
 
+def test_headings_of_one_stamp_are_one_heading(run: SimulatedRun) -> None:
+    """A receiver's clock that is set back by whole seconds, as from GPS time to UTC, writes the same stamps again: it ended in a traceback."""
+    imu, headings = of(run)
+    twice = sorted([*headings, *headings], key=lambda m: m.stamp_ns)
+    assert wander_deg(imu, twice) == wander_deg(imu, headings)
+    assert turn_warnings(imu, "compass", twice, "enu") == []
+    assert not scattered(imu, twice).any()
+
+
 def test_what_is_no_wander_is_not_taken_for_it(run: SimulatedRun) -> None:
     """Noise, the gyro's bias and scale, iron that turns with the vessel, late stamps."""
     imu, headings = of(run)
