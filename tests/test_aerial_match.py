@@ -283,6 +283,41 @@ def test_modes_are_those_of_the_posterior() -> None:
     assert none == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("turned_deg", [0.0, 31.0, 118.0])
+def test_a_quay_without_an_end_in_view_says_nothing_along_itself(turned_deg: float) -> None:
+    """How well the map shows its edge varies along it by some nats: of a canal that made places out of, with sigmas of 1 m, 4 m off."""
+    g = grid(26)
+    yaw, north, east = np.meshgrid(g.yaw_rad, g.north_m, g.east_m, indexing="ij")
+    ahead = np.array([np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))])
+    aside = np.array([-ahead[1], ahead[0]])
+    along, across = (east * d[0] + north * d[1] for d in (ahead, aside))
+    ridge = 25.0 - 0.5 * ((across - 0.4) / 0.25) ** 2 - 0.5 * ((yaw - 0.01) / np.radians(0.6)) ** 2
+    uneven = (ridge + 2.5 * np.sin(along / 1.1 + 1.0)).astype(np.float32)
+    (mode,), none = modes_of(uneven, g, 5.0, 0.05)
+    assert none < 0.1
+    assert mode.pose[:2] @ aside == pytest.approx(0.4, abs=0.05)
+    assert mode.pose[2] == pytest.approx(0.01, abs=0.002)
+    assert np.sqrt(ahead @ mode.cov[:2, :2] @ ahead) > 15.0
+    assert np.sqrt(aside @ mode.cov[:2, :2] @ aside) < 0.35
+    assert np.sqrt(mode.cov[2, 2]) < np.radians(1.0)
+    # Where it ends is a place.
+    end = np.maximum(ridge + 15.0 * np.exp(-0.5 * ((along - 1.5) / 0.4) ** 2), 0.0).astype(np.float32)
+    (mode, *_), _ = modes_of(end, g, 5.0, 0.05)
+    assert mode.pose[:2] @ ahead == pytest.approx(1.5, abs=0.1)
+    assert np.sqrt(ahead @ mode.cov[:2, :2] @ ahead) < 0.5
+
+
+def test_a_wall_beside_the_window_is_no_ridge_of_it() -> None:
+    """Its best line lies outside; of a wall that goes out of the window the best place may be at its face."""
+    g = grid(26)
+    yaw, north, east = np.meshgrid(g.yaw_rad, g.north_m, g.east_m, indexing="ij")
+    aside = np.maximum(25.0 - 0.5 * ((north - 7.0) / 0.25) ** 2 - 0.5 * (yaw / np.radians(0.6)) ** 2, 0.0)
+    assert not modes_of(aside.astype(np.float32), g, 5.0, 0.05)[0]
+    out = np.maximum(25.0 - 0.5 * (north / 0.25) ** 2 - 0.5 * (yaw / np.radians(0.6)) ** 2 + 0.2 * east, 0.0)
+    (mode,), _ = modes_of(out.astype(np.float32), g, 5.0, 0.05)
+    assert abs(mode.pose[1]) < 0.05
+
+
 def with_evidence(places: int, turns: int = 1) -> Outline:
     """Places on no common line: each is evidence of 1."""
     none = np.zeros(0)

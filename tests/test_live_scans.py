@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from graphloc import app
+from graphloc.blocks import MountConfig
 from graphloc.config import AerialConfig, LidarConfig
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends import decode
@@ -451,6 +452,7 @@ def turns_of(
     monkeypatch: pytest.MonkeyPatch,
     *messages: tuple[str, float, float],
     stamps: Literal["header", "recorded"] = "header",
+    mounted: str | None = None,
 ) -> list[Turn]:
     def decode_cloud(_: float, stamp_ns: int, name: str) -> Cloud:
         return Cloud(name, stamp_ns, np.ones((1, 3)), np.array([stamp_ns], dtype=np.int64))
@@ -460,7 +462,9 @@ def turns_of(
 
     monkeypatch.setattr(decode, "header_stamp_ns", header_stamp_ns)
     monkeypatch.setattr(scans, "decode_cloud", decode_cloud)
-    config = AerialConfig(lidars={n: LidarConfig(topic=f"/{n}") for n in ("one", "two")}, stamps=stamps)
+    mount = MountConfig(tf_frame=mounted) if mounted else MountConfig()
+    config = AerialConfig(lidars={n: LidarConfig(topic=f"/{n}", mount=mount) for n in ("one", "two")}, stamps=stamps)
+    monkeypatch.setattr(scans, "mounts_of", lambda *_: {})
     return list(ScanFeed(Heap(*messages), config, "base_link"))  # type: ignore[arg-type]
 
 
@@ -481,6 +485,29 @@ def test_turns_arrive_with_the_message_that_ends_them(monkeypatch: pytest.Monkey
 def test_scans_without_stamps_are_of_when_they_were_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     (turn,) = turns_of(monkeypatch, ("one", np.nan, 1.1), ("two", np.nan, 1.14), stamps="recorded")
     assert [c.stamp_ns - BEGIN for c in turn.clouds] == [1_100_000_000, 1_140_000_000]
+
+
+@pytest.mark.parametrize("mounted", [None, "left", "right", "mast"])
+def test_two_lidars_on_one_topic_are_not_placed_by_one_mount(
+    mounted: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mount's frame tells which is meant, the first scan where it does not; scans that name none may be its own."""
+    frames = {1.0: "/left", 2.0: "right", 3.0: "left", 4.0: "", 5.0: "right"}
+
+    class Framed(float):
+        @property
+        def header(self) -> SimpleNamespace:
+            return SimpleNamespace(frame_id=frames[float(self)])
+
+    monkeypatch.setattr(Heap, "decode", lambda _, raw: Framed(raw.data))
+    found = turns_of(monkeypatch, *(("one", t, t + 0.1) for t in frames), mounted=mounted)
+    other, own = ("left", "right") if mounted == "right" else ("right", "left")
+    refused = [t for t in found if not t.clouds]
+    assert len(refused) == (1 if mounted == "right" else 2)  # its first scan is not known to be another's
+    said = (
+        f"/one: a scan in frame '{other}' where others are in '{own}': of another LiDAR, whose mount is not that of one"
+    )
+    assert {t.why_not for t in refused} == {f"{said}; record each on a topic of its own"}
 
 
 def test_a_damaged_scan_is_answered_at_once(monkeypatch: pytest.MonkeyPatch, seen: Seen) -> None:

@@ -125,6 +125,17 @@ def test_a_part_of_a_folder_of_tiles_says_what_to_name(tmp_path: Path) -> None:
             assert f", {folder}: a folder of tiles has z/x/y" in str(said.value)
 
 
+def test_a_folder_of_sheets_says_how_to_make_them_one(tmp_path: Path) -> None:
+    """Agencies cut an image of a town into sheets, each with a georeference of its own."""
+    for name in ("dop10_2.tif", "dop10_1.tif", "dop10_1.tfw", "readme.txt"):
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match=r"folder of 2 images, such as dop10_1.tif: .* gdalbuildvrt all.vrt \*.tif"):
+        AerialImage(tmp_path, Datum(SWEDEN))
+    (tmp_path / "dop10_2.tif").unlink()
+    with pytest.raises(InputError, match=r"one image in it: name dop10_1.tif itself$"):
+        AerialImage(tmp_path, Datum(SWEDEN))
+
+
 def test_what_else_lies_among_tiles_does_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """But a level 019 is none: GDAL would ask for 19."""
     folder = lay(tmp_path / "tiles", 19, tiled(19), "png")

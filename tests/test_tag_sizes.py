@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from graphloc.frontends.tags.sizes import size_factors
+from graphloc.gather._gathering import Gathering
+from graphloc.gather._sightings import _take_sized
 from graphloc.measurements import TagSighting
 from graphloc.survey import Survey, TagConfig
 from tests import tagfactory
@@ -52,12 +55,28 @@ def surveyed_to(sigma_m: float, sigma_deg: float, seed: int) -> Change:
 
 
 @pytest.mark.parametrize("kind", ["fixed", "floating"])
-@pytest.mark.parametrize("share", [1.25, 0.8, 0.393])
+@pytest.mark.parametrize("share", [1.25, 0.8, 0.393, 1.06])
 def test_sizes_that_are_all_wrong(kind: str, share: float) -> None:
-    """The white margin measured, too (10 cells for 8); a border left out; the size of a well-known example."""
+    """The white margin measured, too (10 cells for 8); a border left out; the size of a well-known example; scaled by a printer."""
     sightings, survey = seen(kind, 1, sized(share * TRUE_M))
     frame = "world" if kind == "fixed" else "north_dock"
     assert size_factors(sightings, survey) == {frame: pytest.approx(1.0 / share, rel=0.02)}
+
+
+@pytest.mark.parametrize(("share", "refused"), [(1.0, None), (1.06, False), (0.94, False), (1.25, True)])
+def test_sizes_that_are_slightly_wrong_are_said_and_used(share: float, refused: bool | None) -> None:
+    """A print scaled by some per cent: the run by itself blames places and attitudes of single tags."""
+    sightings, survey = seen("fixed", 1, sized(share * TRUE_M))
+    gathered = Gathering(voyage("fixed", 1).recording)
+    _take_sized(gathered, "tags", sightings, survey)
+    said = [line for line in gathered.said if "sizes in tags.yaml disagree with the spacing" in line]
+    assert len(said) == (0 if refused is None else 1)
+    used = sum(isinstance(m, TagSighting) for m in gathered.recording().measurements)
+    assert used == (0 if refused else len(sightings))
+    if refused is not None:
+        (factor,) = re.findall(r"size_m times (\d\.\d\d) would agree", said[0])
+        assert float(factor) == pytest.approx(1.0 / share, abs=0.015)
+        assert ("no sighting of these tags is used" in said[0]) == refused
 
 
 def test_two_tags_are_enough() -> None:

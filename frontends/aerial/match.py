@@ -20,6 +20,12 @@ STEP_DEG = 0.5
 _LEAST_SHARE = 0.01  # of the posterior that a mode must have
 _NARROW, _FINER = 5, 5  # a mode of fewer cells across is looked at between them, so much finer
 _FLOOR = np.array([0.05, 0.05, np.radians(0.1)])  # m, rad: no image tells more
+# A ridge through all of the window that falls by less than so many nats, times the root of its length in m, says nothing along itself.
+_CHANCE = 2.5
+_UNTOLD_M = 20.0  # 1 sigma along it; less would say the window itself, match after match
+_ACROSS_M = 0.6  # half width of a ridge, around its line
+_RIDGE_STEP_DEG = 3.0
+_NOTHING = 1e-9  # of the best pose's mass: a piece beside the end of a ridge
 # TBB, Numba's first choice, warns on stderr where the one that is installed is older than it likes.
 numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined]
 
@@ -108,6 +114,9 @@ def modes_of(
 ) -> tuple[list[Mode], float]:
     """Return the modes of a posterior (H, R, C), best first, and the probability that none is right.
 
+    A ridge that goes straight through the window and hardly falls, as of a quay without an end in view, is one mode, whose covariance
+    leaves open where along it the vessel is: how complete the map's edges are varies along a wall, and that is no place.
+
     Args:
         none_log: log-likelihood of a pose where the scan fits by chance, relative to the mean of all.
         alien: probability that the scan shows something that the image does not, whatever the score.
@@ -118,6 +127,8 @@ def modes_of(
     total = mass.sum() + none
     peaks = (ndimage.maximum_filter(log_likelihood, 3) == log_likelihood) & (log_likelihood > top - 9.0)
     free = np.ones(mass.shape, dtype=bool)
+    profile = ndimage.maximum_filter(log_likelihood.max(axis=0), 3)
+    cell_m = abs(float(grid.east_m[1] - grid.east_m[0]))
     found: list[Mode] = []
     spots = np.argwhere(peaks)
     for spot in spots[np.argsort(-log_likelihood[tuple(spots.T)])]:
@@ -128,14 +139,65 @@ def modes_of(
         height = log_likelihood[tuple(spot)]
         labels, _ = ndimage.label(free & (log_likelihood > height - 4.5))
         part = labels == labels[tuple(spot)]
+        along = _open_along(profile, spot[1:], float(height), cell_m)
+        if along is not None:
+            part |= free & _beside(along, spot[1:], mass.shape[1:], cell_m)
         free &= ~part
         share = float(mass[part].sum() / total) * (1.0 - alien)
         cells = np.nonzero(part)
         if share < _LEAST_SHARE or _cut_off(spot, cells, mass.shape):
             continue
-        mean, cov = _moments(log_likelihood, cells, mass, grid)
+        if along is None:
+            mean, cov = _moments(log_likelihood, cells, mass, grid)
+        else:
+            mean, cov = _moments_across(cells, mass, grid, along, cell_m)
         found.append(Mode(mean, cov + np.diag(_FLOOR**2), share))
     return sorted(found, key=lambda m: -m.probability), 1.0 - sum(m.probability for m in found)
+
+
+def _open_along(profile: NDArray[np.float32], spot: NDArray[np.int64], height: float, cell_m: float) -> Array | None:
+    """Return the direction (2,), rows and columns, of a straight ridge through a peak from border to border; None if there is none.
+
+    Args:
+        profile: (R, C) highest log-likelihood of any yaw in a cell and its neighbours. spot: (2,) row and column. height: of the peak.
+    """
+    size = np.array(profile.shape)
+    angle = np.radians(np.arange(0.0, 180.0, _RIDGE_STEP_DEG))
+    along = np.column_stack([np.sin(angle), np.cos(angle)])
+    steps = np.arange(-int(np.hypot(*size)), int(np.hypot(*size)) + 1)
+    at = np.rint(spot + steps[:, None] * along[:, None]).astype(np.int64)
+    within = ((at >= 0) & (at < size)).all(axis=2)
+    at = np.clip(at, 0, size - 1)
+    lowest = np.where(within, profile[at[..., 0], at[..., 1]], np.inf).min(axis=1)
+    long = within.sum(axis=1)  # a peak near a corner has short lines
+    falls = np.where(long >= 0.9 * size.min(), height - lowest, np.inf)
+    best = int(np.argmin(falls))
+    return along[best] if falls[best] < _CHANCE * np.sqrt(long[best] * cell_m) else None
+
+
+def _beside(along: Array, spot: NDArray[np.int64], shape: tuple[int, ...], cell_m: float) -> NDArray[np.bool_]:
+    """Return which cells (R, C) lie beside a line through a peak."""
+    row, column = np.indices(shape)
+    return np.asarray(
+        np.abs((row - spot[0]) * along[1] - (column - spot[1]) * along[0]) * cell_m <= _ACROSS_M + 0.5 * cell_m
+    )
+
+
+def _moments_across(
+    part: tuple[NDArray[np.int64], ...], mass: Array, grid: SearchGrid, along: Array, cell_m: float
+) -> tuple[Array, Array]:
+    """Return mean (3,) and covariance (3, 3) of a ridge with each piece of its length alike, and open along it."""
+    values = np.column_stack([grid.east_m[part[2]], grid.north_m[part[1]], grid.yaw_rad[part[0]]])
+    direction = np.array([along[1], -along[0]])  # rows run south
+    piece = np.rint((values[:, :2] @ direction) / cell_m).astype(np.int64)
+    piece -= piece.min()
+    w = mass[part] / np.maximum(np.bincount(piece, mass[part]), _NOTHING)[piece]
+    w /= w.sum()
+    mean = w @ values
+    cov = (values - mean).T @ (w[:, None] * (values - mean))
+    ridge = cov[:, :2] @ direction
+    ridge /= ridge[:2] @ direction  # its heading may turn along it
+    return mean, cov + _UNTOLD_M**2 * np.outer(ridge, ridge)
 
 
 def _cut_off(spot: NDArray[np.int64], cells: tuple[NDArray[np.int64], ...], shape: tuple[int, ...]) -> bool:

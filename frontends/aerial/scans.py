@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from graphloc.config import AerialConfig
 from graphloc.errors import InputError
@@ -143,6 +144,7 @@ def _turns(bag: Bag, config: AerialConfig) -> Iterator[Turn]:
     If one is missing, or is slower than that, the others form a turn without it.
     """
     names = {lidar.topic: name for name, lidar in config.lidars.items()}
+    frames: dict[str, str] = {}
     turn: dict[str, Cloud] = {}
     now_ns = 0
 
@@ -156,6 +158,7 @@ def _turns(bag: Bag, config: AerialConfig) -> Iterator[Turn]:
             stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns, recorded=config.stamps == "recorded")
             if stamp_ns is None:
                 raise ValueError(f"its header has no stamp: {NO_STAMP}")
+            _refuse_another(frames, name, msg, config.lidars[name].mount.tf_frame)
             cloud = decode_cloud(msg, stamp_ns, name)
         except Exception as error:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
             said = str(error) if isinstance(error, ValueError) else f"cannot be decoded ({type(error).__name__})"
@@ -172,3 +175,18 @@ def _turns(bag: Bag, config: AerialConfig) -> Iterator[Turn]:
             turn = {}
     if turn:
         yield whole()
+
+
+def _refuse_another(frames: dict[str, str], lidar: str, msg: Any, mounted: str | None) -> None:
+    """Refuse a scan of another LiDAR on the topic: one mount places all of a topic.
+
+    Args:
+        frames: by LiDAR, the frame of its scans: the first that one of them names, or that of its mount (`mounted`) once one does.
+    """
+    frame = str(getattr(getattr(msg, "header", None), "frame_id", "")).lstrip("/")
+    own = frames[lidar] = frame if frame and frame == mounted else frames.get(lidar) or frame
+    if frame and frame != own:
+        raise ValueError(
+            f"a scan in frame '{frame}' where others are in '{own}': of another LiDAR, whose mount is not that of {lidar}; "
+            "record each on a topic of its own"
+        )

@@ -19,6 +19,7 @@ from graphloc.frames import Datum
 
 _HALF_M = 20037508.342789244  # Web Mercator is a square of twice that: pi * 6378137
 _KINDS = {".png", ".jpg", ".jpeg", ".webp"}
+_SHEETS = {".tif", ".tiff", ".jp2", ".jpg", ".jpeg", ".png", ".ecw", ".vrt"}  # as agencies cut an image of a town
 _NUMBER = re.compile("0|[1-9][0-9]*")
 _DEEPEST = 22  # 2^22 tiles of 256 pixels fill GDAL's 2^31 columns nearly; a pixel is 2 cm at 57 deg
 _FAR_M = 100e3
@@ -48,6 +49,8 @@ def _described(folder: Path, datum: Datum) -> str:
     n: int = 2**zoom
     columns = {x: p for x, p in _folders(levels[zoom]).items() if x < n} if levels else {}
     if not columns:
+        if sheets := _sheets_of(folder):
+            raise InputError(f"{folder}: {sheets}")
         raise InputError(f"{folder}: {_part_of(folder) or 'no tiles in it'}: {_WANTED}")
     across, down = _tile_of(datum, zoom)
 
@@ -116,6 +119,19 @@ def _part_of(folder: Path) -> str:
     if any(_tiles(p) for p in _folders(here).values()):
         return f"one level of tiles; name the folder above it, {here.parent}"
     return ""
+
+
+def _sheets_of(folder: Path) -> str:
+    """Return what to do with a folder of images that are no tiles; empty if it holds none."""
+    sheets = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SHEETS and not _NUMBER.fullmatch(p.stem))
+    if not sheets:
+        return ""
+    if len(sheets) == 1:
+        return f"a folder, with one image in it: name {sheets[0].name} itself"
+    return (
+        f"a folder of {len(sheets)} images, such as {sheets[0].name}: make them one, "
+        f"gdalbuildvrt all.vrt *{sheets[0].suffix}, and name all.vrt"
+    )
 
 
 def _tile_of(datum: Datum, zoom: int) -> tuple[float, float]:

@@ -20,7 +20,9 @@ from graphloc.survey import Survey, TagConfig
 
 _FEWEST, _TRIED = 8, 12  # images
 _MOST = 0.5  # share of images
-_OFF, _ALIKE = 0.1, 0.03  # of the factor: less is left to the run, which says so; its scatter from image to image
+REFUSED = 0.1
+"""How far a factor is from 1, at least, for its tags not to be used: with smaller ones a run is off by less than without them."""
+_OFF, _ALIKE = 0.02, 0.03  # of the factor that is worth a word; its scatter from image to image
 _LOG_FACTORS = (-1.6, 1.6)  # 0.2 to 5
 _SURE = 5.0  # sigmas, of what image and survey together tell; and of the survey alone, as large errors do not add up so
 

@@ -14,7 +14,7 @@ from graphloc.frames import Datum
 from graphloc.frontends._part import Bags
 from graphloc.frontends.tags.grid import in_world
 from graphloc.frontends.tags.sightings import camera_info_topic, sightings_of_bag
-from graphloc.frontends.tags.sizes import size_factors
+from graphloc.frontends.tags.sizes import REFUSED, size_factors
 from graphloc.gather._gathering import Gathering
 from graphloc.measurements import TagSighting
 from graphloc.recording import Progress, Recording
@@ -95,15 +95,26 @@ def with_sightings(recording: Recording, config: VesselConfig, bags: Bags, progr
 
 
 def _take_sized(gathered: Gathering, name: str, sightings: Sequence[TagSighting], survey: Survey) -> None:
-    """Take the sightings but of frames whose tags have sizes that cannot be: a run that follows those is metres off."""
+    """Take the sightings but of frames whose tags have sizes that cannot be: a run that follows those is metres off.
+
+    Where they are off by less, it blames places and attitudes of single tags: so the sizes are named first.
+    """
     reasons = {}
     for frame, factor in size_factors(sightings, survey).items():
         off = 100.0 * abs(1.0 / factor - 1.0)
-        reasons[frame] = f"sizes in tags.yaml disagree with the spacing of the tags by {off:.0f} %"
-        gathered.said.append(
-            f"{name}: {reasons[frame]}: measure a tag (the black square without its white margin) and the spacing; in {frame} "
-            f"size_m times {factor:.2f} would agree. Until then no sighting of these tags is used"
+        why = f"sizes in tags.yaml disagree with the spacing of the tags by {off:.0f} %"
+        refused = abs(factor - 1.0) > REFUSED
+        until = (
+            "no sighting of these tags is used"
+            if refused
+            else "distances to them are wrong by as much, beyond any bound"
         )
+        gathered.said.append(
+            f"{name}: {why}: measure a tag (the black square without its white margin) and the spacing; in {frame} "
+            f"size_m times {factor:.2f} would agree. Until then {until}"
+        )
+        if refused:
+            reasons[frame] = why
     for m in sightings:
         if m.frame in reasons:
             gathered.refuse(name, m.stamp_ns, reasons[m.frame])
