@@ -300,11 +300,36 @@ def test_a_quay_without_an_end_in_view_says_nothing_along_itself(turned_deg: flo
     assert np.sqrt(ahead @ mode.cov[:2, :2] @ ahead) > 15.0
     assert np.sqrt(aside @ mode.cov[:2, :2] @ aside) < 0.35
     assert np.sqrt(mode.cov[2, 2]) < np.radians(1.0)
+    # What rows of boats show has lines across it: which of them is which the score may tell.
+    across_too = modes_of(uneven, g, 5.0, 0.05, normals=np.diag([0.5, 0.5]))[0]
+    assert np.sqrt(ahead @ across_too[0].cov[:2, :2] @ ahead) < 5.0
+    walls = 0.95 * np.outer(aside, aside) + 0.05 * np.outer(ahead, ahead)  # in body, which heads east
+    (mode, *more), _ = modes_of(uneven, g, 5.0, 0.05, normals=walls)
+    assert not more
+    assert np.sqrt(ahead @ mode.cov[:2, :2] @ ahead) > 15.0
     # Where it ends is a place.
     end = np.maximum(ridge + 15.0 * np.exp(-0.5 * ((along - 1.5) / 0.4) ** 2), 0.0).astype(np.float32)
     (mode, *_), _ = modes_of(end, g, 5.0, 0.05)
     assert mode.pose[:2] @ ahead == pytest.approx(1.5, abs=0.1)
     assert np.sqrt(ahead @ mode.cov[:2, :2] @ ahead) < 0.5
+
+
+def test_normals_are_those_of_the_lines_in_view() -> None:
+    """Of two walls along a canal, to its left and right at 31 deg; then with one across it, and of poles alone."""
+    a = np.radians(31.0)
+    ahead, aside = np.array([np.cos(a), np.sin(a)]), np.array([-np.sin(a), np.cos(a)])
+    t, up = np.meshgrid(np.arange(-40.0, 40.0, 0.1), np.arange(0.4, 1.6, 0.15))
+
+    def seen(*walls: tuple[Array, Array]) -> Array:
+        flat = np.vstack([np.column_stack([p + t.reshape(-1, 1) * d, up.ravel()]) for p, d in walls])
+        return outline(LevelCloud(flat, np.zeros((len(flat), 2))), None).normals
+
+    banks = [(13.0 * aside, ahead), (-13.0 * aside, ahead)]
+    assert np.trace(seen(*banks)) == pytest.approx(1.0)
+    assert ahead @ seen(*banks) @ ahead < 0.02
+    assert ahead @ seen(*banks, (30.0 * ahead, aside)) @ ahead > 0.15
+    poles = [(12.0 * (k - 3.0) * ahead + 5.0 * aside, np.zeros(2)) for k in range(7)]
+    np.testing.assert_allclose(seen(*poles), 0.5 * np.eye(2), atol=0.1)
 
 
 def test_a_wall_beside_the_window_is_no_ridge_of_it() -> None:

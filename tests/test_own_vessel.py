@@ -54,6 +54,7 @@ def test_what_stays_outside_of_the_hull() -> None:
     ring = np.column_stack([4.0 * np.cos(angle) - 0.5, 4.0 * np.sin(angle), np.full(90, 4.0)])
     (line,) = said(40.0, np.vstack([DECK, ring]), HULL)
     assert "points outside hull_m stay with the vessel" in line
+    assert "spray or rain" in line
     assert "upside down" in line
 
 

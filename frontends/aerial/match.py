@@ -25,6 +25,7 @@ _CHANCE = 2.5
 _UNTOLD_M = 20.0  # 1 sigma along it; less would say the window itself, match after match
 _ACROSS_M = 0.6  # half width of a ridge, around its line
 _RIDGE_STEP_DEG = 3.0
+_PARALLEL = 0.3  # share of a scan's lines that cross a ridge, up to which it is of parallel walls: of rows of boats 0.33 and more
 _NOTHING = 1e-9  # of the best pose's mass: a piece beside the end of a ridge
 # TBB, Numba's first choice, warns on stderr where the one that is installed is older than it likes.
 numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined]
@@ -110,16 +111,23 @@ class Mode:
 
 
 def modes_of(
-    log_likelihood: NDArray[np.float32], grid: SearchGrid, none_log: float, alien: float, most: int = 5
+    log_likelihood: NDArray[np.float32],
+    grid: SearchGrid,
+    none_log: float,
+    alien: float,
+    most: int = 5,
+    normals: Array = np.zeros((2, 2)),  # noqa: B008
 ) -> tuple[list[Mode], float]:
     """Return the modes of a posterior (H, R, C), best first, and the probability that none is right.
 
-    A ridge that goes straight through the window and hardly falls, as of a quay without an end in view, is one mode, whose covariance
-    leaves open where along it the vessel is: how complete the map's edges are varies along a wall, and that is no place.
+    A ridge that goes straight through the window and hardly falls, of a scan whose lines go along it as well (a quay without an end in
+    view), is one mode, whose covariance leaves open where along it the vessel is: how complete the map's edges are varies along a wall,
+    and that is no place.
 
     Args:
         none_log: log-likelihood of a pose where the scan fits by chance, relative to the mean of all.
         alien: probability that the scan shows something that the image does not, whatever the score.
+        normals: (2, 2), as in `Outline`.
     """
     top = float(log_likelihood.max())
     mass = np.exp(log_likelihood.astype(float) - top)
@@ -140,6 +148,8 @@ def modes_of(
         labels, _ = ndimage.label(free & (log_likelihood > height - 4.5))
         part = labels == labels[tuple(spot)]
         along = _open_along(profile, spot[1:], float(height), cell_m)
+        if along is not None and _told(along, normals, float(grid.yaw_rad[spot[0]])) > _PARALLEL:
+            along = None
         if along is not None:
             part |= free & _beside(along, spot[1:], mass.shape[1:], cell_m)
         free &= ~part
@@ -173,6 +183,13 @@ def _open_along(profile: NDArray[np.float32], spot: NDArray[np.int64], height: f
     falls = np.where(long >= 0.9 * size.min(), height - lowest, np.inf)
     best = int(np.argmin(falls))
     return along[best] if falls[best] < _CHANCE * np.sqrt(long[best] * cell_m) else None
+
+
+def _told(along: Array, normals: Array, yaw_rad: float) -> float:
+    """Return the share of a scan's lines that say where along a direction (2,), rows and columns, it is, at a heading."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    ahead = np.array([c * along[1] - s * along[0], -s * along[1] - c * along[0]])  # in body; rows run south
+    return float(ahead @ normals @ ahead)
 
 
 def _beside(along: Array, spot: NDArray[np.int64], shape: tuple[int, ...], cell_m: float) -> NDArray[np.bool_]:

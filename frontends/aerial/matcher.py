@@ -197,7 +197,7 @@ class Matcher:
         grid = grid_around(layers, prior.pose, half_m, half_deg)
         score = log_likelihood_of(found, layers, grid)
         trust = _trust(score, _within(prior.sigma, np.array([half_m, half_m, np.radians(half_deg)])))
-        modes, _ = modes_of(score, grid, _NONE_LOG, 1.0 - trust, _MODES)
+        modes, _ = modes_of(score, grid, _NONE_LOG, 1.0 - trust, _MODES, found.normals)
         modes = BELIEF.less_decided(modes, BELIEF.share(found))  # which modes there are does not turn on it
         none = 1.0 - sum(m.probability for m in modes)
         why_not = "" if modes else NO_POSE

@@ -79,7 +79,7 @@ class Staying:
             return [
                 f"hull_m is empty, and {seen} stay with the vessel: herself, unless {_WALL}; give her outline, at least hull_m: {box}"
             ]
-        water = "water, by a waterline_m that is too low or a LiDAR's mount upside down"
+        water = "spray or rain, water, by a waterline_m that is too low or a LiDAR's mount upside down"
         return [f"{seen} outside hull_m stay with the vessel, within {box}: herself, {water}, or {_WALL}"]
 
     def _hanging_together(self, cells_m: Array) -> Array:

@@ -6,7 +6,7 @@ Points are in the frame `level`: origin and yaw of body, horizontal x-y plane, h
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ _SHORE_M = 2.5  # below that height, returns are of what bounds the water
 _NEAR_M = 1.25  # neighbours that make a line
 _SAME_LINE_RAD, _SAME_LINE_M = np.radians(15.0), 0.3
 _SECTORS = 360
+_NO_LINE = 0.6  # weight of a place on a line of fewer than three
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +52,8 @@ class Outline:
         columns_m: (J, 2) where anything rises out of the water in the scan itself. lowest_m: height over the waterline below which
             a twentieth of its points lies; NaN of none.
         turns: of how many places it is, seen from apart. own: outline of the scan itself; None: this is it.
+        normals: (2, 2) mean of n n^T by weight over the normals n of the lines through faces and first returns, in `level`, trace 1:
+            d^T normals d is the share of the lines that say where along a direction d the scan is. Without a line a place says so both ways.
     """
 
     faces_m: Array
@@ -65,6 +68,7 @@ class Outline:
     lowest_m: float = float("nan")
     turns: int = 1
     own: Outline | None = None
+    normals: Array = field(default_factory=lambda: 0.5 * np.eye(2))
 
     @property
     def evidence(self) -> float:
@@ -90,6 +94,7 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
     at = cells[face]
     direction, share = _lines(at, _NEAR_M)
     shore, to_land = _first_returns(p[dry], origin[dry])
+    shore_line, shore_share = _lines(shore, 2.0 * _NEAR_M)
     return Outline(
         faces_m=at,
         line_rad=direction,
@@ -97,12 +102,13 @@ def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float 
         face_share=share,
         shore_m=shore,
         to_land_rad=to_land,
-        shore_share=_lines(shore, 2.0 * _NEAR_M)[1],
+        shore_share=shore_share,
         water_m=_free_water(shore, p[~dry]),
         columns_m=own.columns_m if own else cells,
         lowest_m=float(np.quantile(p[now, 2], 0.05)) if now.any() else float("nan"),
         turns=cloud.turns,
         own=own,
+        normals=_normals(np.append(direction, shore_line), np.append(share, shore_share)),
     )
 
 
@@ -154,6 +160,15 @@ def _lines(at: Array, near_m: float) -> tuple[Array, Array]:
     joined = coo_matrix((np.ones(int(on_it.sum())), (i[on_it], j[on_it])), shape=(len(at), len(at)))
     _, line = connected_components(joined, directed=False)
     return np.asarray(direction), np.asarray(1.0 / np.sqrt(np.bincount(line)[line]))
+
+
+def _normals(line_rad: Array, share: Array) -> Array:
+    """Return `Outline.normals` of places (N,), by the direction of their lines and their weights."""
+    if not len(share):
+        return 0.5 * np.eye(2)
+    x, y = np.where(share > _NO_LINE, np.sqrt(0.5), [-np.sin(line_rad), np.cos(line_rad)])
+    xy = np.where(share > _NO_LINE, 0.0, x * y)
+    return np.asarray(np.array([[share @ x**2, share @ xy], [share @ xy, share @ y**2]]) / share.sum())
 
 
 def _first_returns(p: Array, origin: Array) -> tuple[Array, Array]:
