@@ -116,7 +116,7 @@ def modes_of(
     none_log: float,
     alien: float,
     most: int = 5,
-    normals: Array = np.zeros((2, 2)),  # noqa: B008
+    normals: Array | None = None,
 ) -> tuple[list[Mode], float]:
     """Return the modes of a posterior (H, R, C), best first, and the probability that none is right.
 
@@ -127,7 +127,7 @@ def modes_of(
     Args:
         none_log: log-likelihood of a pose where the scan fits by chance, relative to the mean of all.
         alien: probability that the scan shows something that the image does not, whatever the score.
-        normals: (2, 2), as in `Outline`.
+        normals: (2, 2), as in `Outline`; None: nothing that the scan shows lies across a ridge.
     """
     top = float(log_likelihood.max())
     mass = np.exp(log_likelihood.astype(float) - top)
@@ -148,8 +148,9 @@ def modes_of(
         labels, _ = ndimage.label(free & (log_likelihood > height - 4.5))
         part = labels == labels[tuple(spot)]
         along = _open_along(profile, spot[1:], float(height), cell_m)
-        if along is not None and _told(along, normals, float(grid.yaw_rad[spot[0]])) > _PARALLEL:
-            along = None
+        if along is not None and normals is not None:
+            across = _told(along, normals, float(grid.yaw_rad[spot[0]]))
+            along = None if across > _PARALLEL else along
         if along is not None:
             part |= free & _beside(along, spot[1:], mass.shape[1:], cell_m)
         free &= ~part
