@@ -233,7 +233,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         in_body={frame: _turned(pose) for frame in tree.frames if (pose := tree.resolve(body, frame))} if down else {},
         warnings=(
             *bag.warnings,
-            *(said for report in gnss for said in (report.stored, report.frozen) if said),
+            *(said for report in gnss for said in (report.stored, report.frozen, report.in_radians) if said),
             *(apart_warning(report) for report in gnss[:1] if report.differs),
             *_steps(bag),
             *unused_topics(list(bag.streams.values()), used),
