@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from graphloc.config import GnssConfig, SlowErrorConfig
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends import _clock
-from graphloc.frontends._fixes import RTK_SIGMA_M, scatter_m, stored, stored_warning, uneven
+from graphloc.frontends._fixes import RTK_SIGMA_M, radians_warning, scatter_m, stored, stored_warning, uneven
 from graphloc.frontends._reports import GnssReport, PartOfFixes, TopicReport, Vec
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import TopicData
@@ -298,6 +298,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         spans_s=float(stamps[-1] - stamps[0]) / NS_PER_S,
         frozen="".join(frozen_fixes_warning(fixes.topic, stamps, bad)),
         stored="".join(stored_warning(fixes.topic, places[:, :3], old)),
+        in_radians="".join(radians_warning(fixes.topic, rows[:, :3])),
         slow_error=not precise,
         by_turns=_by_turns(stamps[~bad], own, rows[~bad], known[~bad], sigmas[~bad], fixed[~bad]),
         why=why,

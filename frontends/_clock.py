@@ -29,6 +29,10 @@ NO_DATE_NS = 946_684_800 * NS_PER_S
 """2000-01-01: a stamp before it is no date."""
 SCANS_AHEAD_S = 0.15
 """Scans are stamped later than an IMU's samples that come at once by no more: these may take as long on their way."""
+GPS_AHEAD_S = 18.0
+"""GPS time is ahead of UTC by, since 2017."""
+LEAP_S = 0.5
+"""By how much a clock may be off that and still be taken for it."""
 GAIN_LIMIT_S = 0.1
 """A clock that gains more on another during a run is said to drift."""
 
@@ -103,6 +107,8 @@ class ClockStep(NamedTuple):
         """Return it in words, with what to do."""
         way = "forward" if self.by_s > 0.0 else "back"
         said = f"the clock of {whose} was set {way} by {abs(self.by_s):.2f} s at {utc_text(self.at_ns)}, recording time"
+        if abs(abs(self.by_s) - GPS_AHEAD_S) < LEAP_S:
+            said += f", as from {'UTC to GPS time' if self.by_s > 0.0 else 'GPS time to UTC'}"
         return f"{said}: no time_offset_s holds on both sides, and no bound includes it; take one side (--start, --duration)"
 
     @property

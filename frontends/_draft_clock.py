@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 
 from graphloc.frontends._clock import (
     EPOCH_LIMIT_S,
+    GPS_AHEAD_S,
+    LEAP_S,
     MOST_ON_ITS_WAY_S,
     SCANS_AHEAD_S,
     Clock,
@@ -25,7 +27,6 @@ from graphloc.frontends.decode import UNSTAMPED
 
 # Of a velocity that is averaged over seconds: its error lasts as long, and would count as white.
 _FILTERED_SIGMA_MPS = 1.0
-_GPS_AHEAD_S = 18.0  # of UTC, since 2017
 _OWN_CLOCK_S = 10.0  # no message takes as long
 _FEWEST_STAMPS = 10  # that tell of a clock
 _STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma: a receiver's stamps; recording times instead of these
@@ -123,7 +124,7 @@ def clock_lines(inspection: Inspection) -> list[str]:
         behind, clock = _behind(topic, topics, inspection) or (0.0, "")
         if abs(behind) > EPOCH_LIMIT_S:
             way = "behind" if behind > 0.0 else "ahead of"
-            why = ": GPS time, which is ahead of UTC by 18 s" if abs(behind + _GPS_AHEAD_S) < 0.5 else ""
+            why = ": GPS time, which is ahead of UTC by 18 s" if abs(behind + GPS_AHEAD_S) < LEAP_S else ""
             off = f"{topic}: its clock is {abs(behind):.1f} s {way} {clock}, by the recording times"
             lines.append(f"{off}{why}; drafted as time_offset_s")
     return lines

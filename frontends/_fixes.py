@@ -18,6 +18,7 @@ from graphloc.white_noise import white_noise_of_thirds
 _HELD_S = 2.5
 """A place that is repeated for less, and then changes, was held by a driver; for longer, the receiver itself stands still."""
 _OFTEN, _CUT = 0.2, 0.6  # shares of a sensor's messages, held or at a stamp again, from which a line is due
+_ORIGIN_DEG = 0.1  # about 0, 0
 _AT_ONCE, _BURST_S = 0.1, 0.3  # of the mean step: within a burst; bursts that are closer than that are left alone
 _FAST_S, _SLOW_S, _EVEN, _FEWEST = 0.25, 1.5, 0.2, 100  # steps: motion hides in none, in few, how even, how many tell
 # Of stamps: how even steps are, how many tell, what part of them shows in the places.
@@ -77,6 +78,21 @@ def stored_warning(sensor: str, lla: Array, bad: NDArray[np.bool_]) -> list[str]
     (old, new), count = lla[[0, int(bad.sum())], :2], int(bad.sum())
     said = f"{sensor}: its first {count} fixes repeat {old[0]:.5f}, {old[1]:.5f}, and the next is at {new[0]:.5f}, {new[1]:.5f}"
     return [f"{said}: {STORED}; they are rejected"]
+
+
+def radians_warning(sensor: str, lla: Array) -> list[str]:
+    """Return a line if all positions (N, 3) lie where coordinates in rad do: a corner of the Gulf of Guinea without land.
+
+    Simulators have their origin at 0, 0.
+    """
+    most = np.abs(lla[:, :2]).max(axis=0) if len(lla) else np.zeros(2)
+    if most.max() < _ORIGIN_DEG or most[0] > np.pi / 2.0 or most[1] > np.pi:
+        return []
+    lat, lon = np.median(lla[:, :2], axis=0)
+    said = f"{sensor}: all fixes lie near {lat:.5f}, {lon:.5f} deg, in the Gulf of Guinea: unless the vessel was there, its driver writes rad"
+    return [
+        f"{said} ({np.degrees(lat):.5f}, {np.degrees(lon):.5f} deg), and the track is 57 times too short: convert them"
+    ]
 
 
 def held_warning(sensor: str, bad: NDArray[np.bool_]) -> list[str]:

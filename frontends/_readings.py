@@ -338,6 +338,7 @@ def reject_far(readings: Readings, config: VesselConfig, warnings: list[str]) ->
     if not fixes:
         return []
     warnings += _sanity.gnss_warnings(readings.sensor, fixes, config)
+    warnings += _fixes.radians_warning(readings.sensor, np.array([v.position for v in fixes]))
     far = rejected(f"over {_sanity.FAR_M / 1e3:.0f} km from the rest of the run")
     return _drop(readings, _sanity.far_fixes(fixes), far, warnings)
 

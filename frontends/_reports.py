@@ -153,6 +153,7 @@ class GnssReport:
             1 sigma; None where that does not tell. late_by: whose motion told so: its own, or that of a velocity of the same device.
         hinted_s: likewise, where that is likelier than none and not clear.
         frozen, stored: warning where it repeats one position while the vessel moves, or one of before the run; '' where it does not.
+        in_radians: warning where its positions look like rad; '' where they do not.
         wander: by how much their error changes along the way, by `wander_by`, wheels or a velocity; empty where these do not tell.
         uneven: how unevenly its fixes are stamped; None where these tell when each was measured.
         apart_m: by how much it and `apart_from`, the receiver it agrees with best, wander against each other, 1 sigma of an axis.
@@ -177,6 +178,7 @@ class GnssReport:
     white_m: float | None = None
     frozen: str = ""
     stored: str = ""
+    in_radians: str = ""
     wander: tuple[Change, ...] = ()
     wander_by: str = ""
     without_height: int = 0

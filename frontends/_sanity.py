@@ -50,11 +50,14 @@ def lever_warning(name: str, t_body_sensor_m: Array, tf_frame: str | None) -> li
 def size_at_ease(accel: Array, gyro_radps: Array) -> tuple[float, bool]:
     """Return the median size of accelerations (N, 3) while the craft turns least, and whether that is little: then it is gravity's alone.
 
-    A fast one in tight circles feels as much again. Rates (N, 3) in deg/s never are little.
+    A fast one in tight circles feels as much again. Rates (N, 3) in deg/s never are little. In a gait, or waves, rates are least at one
+    phase of the heave: then the median of all is nearer to gravity, in either unit, and is returned.
     """
-    rates = np.linalg.norm(gyro_radps, axis=1)
+    rates, sizes = np.linalg.norm(gyro_radps, axis=1), np.linalg.norm(accel, axis=1)
     least = float(np.quantile(rates, _LEAST_TURNING))
-    return float(np.median(np.linalg.norm(accel[rates <= least], axis=1))), least < _AT_EASE_RADPS
+    medians = np.maximum([np.median(sizes[rates <= least]), np.median(sizes)], 1e-12)
+    off = np.abs(np.log(medians / np.array([[1.0], [STANDARD_GRAVITY_MPS2]]))).min(axis=0)
+    return float(medians[int(off.argmin())]), least < _AT_EASE_RADPS
 
 
 def no_gravity_in_si(size: float, at_ease: bool) -> bool:

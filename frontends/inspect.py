@@ -39,6 +39,7 @@ from graphloc.frontends._assess_world import in_map_grid, world_of
 from graphloc.frontends._clock import (
     FEWEST_STAMPS,
     GAIN_LIMIT_S,
+    ClockStep,
     recorder_set,
     refuse_woven,
     steady_logs,
@@ -233,9 +234,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         in_body={frame: _turned(pose) for frame in tree.frames if (pose := tree.resolve(body, frame))} if down else {},
         warnings=(
             *bag.warnings,
-            *(said for report in gnss for said in (report.stored, report.frozen) if said),
+            *(said for report in gnss for said in (report.stored, report.frozen, report.in_radians) if said),
             *(apart_warning(report) for report in gnss[:1] if report.differs),
-            *_steps(bag),
             *unused_topics(list(bag.streams.values()), used),
             *_lacking(bag, imus, gnss, reports),
             *([] if bag.lidars else unread_lidars(bag.topics.values())),
@@ -265,9 +265,11 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
     for stream in streams:
         if stream.msgtype == IMU:
             refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)
+    steps = _clock_steps(streams)
+    warnings = (*warnings, *(at.said(topic) for topic, at in steps.items()))
     return _Contents(
         source=source, topics=topics, streams={s.topic: s for s in streams},
-        aligned={s.topic: s for s in on_one_clock([s for s in streams if len(s)])},
+        aligned={s.topic: s for s in on_one_clock([_as_mostly_set(s, steps) for s in streams if len(s)])},
         tree=tree, lidars=lidars, cameras=cameras, infos=infos, warnings=warnings,
     )  # fmt: skip
 
@@ -389,17 +391,25 @@ def _timed_compass(
     return (report, stream) if again is None or not again.usable else (replace(again, late_s=late_s), timed)
 
 
-def _steps(bag: _Contents) -> list[str]:
-    """Say which clocks were set during the run, unless all were alike: then they are one clock, and what it leaves is a gap."""
-    stamped = [
-        s for s in bag.streams.values() if len(s) >= FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED
-    ]
+def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
+    """Return which clocks were set during the run, by topic, unless all were alike: then they are one clock, and what it leaves is a gap."""
+    stamped = [s for s in streams if len(s) >= FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED]
     steps = {s.topic.partition(" ")[0]: step(s.stamps_ns, s.logs_ns) for s in stamped}
     found = {topic: at for topic, at in steps.items() if at is not None}
     sizes = [at.by_s for at in found.values()]
     if not found or (len(found) == len(steps) and max(sizes) - min(sizes) < GAIN_LIMIT_S):
-        return []
-    return [at.said(topic) for topic, at in found.items()]
+        return {}
+    return found
+
+
+def _as_mostly_set(stream: TopicData, steps: Mapping[str, ClockStep]) -> TopicData:
+    """Return the stream with the stamps of before, or after, its clock was set moved to where most are: else it contradicts itself."""
+    at = steps.get(stream.topic.partition(" ")[0])
+    if at is None:
+        return stream
+    after = stream.logs_ns >= at.at_ns
+    by_ns = round(at.by_s * NS_PER_S)
+    return stream.stamped(stream.stamps_ns + np.where(after, 0, by_ns) - (0 if 2 * after.sum() > len(after) else by_ns))
 
 
 def _lacking(

@@ -580,6 +580,17 @@ def test_wrong_units_and_gravity(tmp_path: Path, accel: Any, gyro: Any, block: d
         assert recording.warnings == ()
 
 
+@pytest.mark.parametrize("unit", ["m/s^2", "g"])
+def test_a_gait_is_no_wrong_unit(unit: str, tmp_path: Path) -> None:
+    """The body turns least at one phase of each step: the median there, 7 m/s^2, was said to be no gravity."""
+    items: list[Item] = []
+    for k in range(500):
+        t, step = START_NS + k * S // 50, np.sin(2.0 * np.pi * 1.9 * k / 50.0)
+        felt = (9.8 + 3.5 * step) / (9.8 if unit == "g" else 1.0)
+        items.append(("/imu", t, MAKE.imu(t, accel=(0.0, 0.0, felt), gyro=(0.0, 0.0, 0.2 * (1.0 + step)))))
+    assert read(tmp_path, items, gnss=None, imu={"topic": "/imu", "accel_unit": unit}).warnings == ()
+
+
 def constant_imu(accel: Any, gyro: Any) -> list[Item]:
     items: list[Item] = []
     for k in range(100):  # its last bits vary, as those of a sensor that is not frozen

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, ImuConfig, VesselConfig, load_config
 from graphloc.frames import Array, Datum, Geodetic, rotation_from_rpy_deg
 from graphloc.frontends._assess_velocity import EITHER, axes_of, velocity_report
+from graphloc.frontends._fixes import radians_warning
 from graphloc.frontends._reports import BODY_AXES, EAST_AXES
 from graphloc.frontends._source import Bag, RawMessage
 from graphloc.frontends._streams import TopicData
@@ -911,6 +912,21 @@ def test_an_imu_that_no_motion_turns_is_turned_as_its_own_heading(turned: bool, 
     assert "does not show its yaw" in found.imus[0].mount.evidence
     assert config.sensors["imu"].mount.rpy_deg == (0.0, 0.0, 180.0 if turned else 0.0)
     assert ("as its orientation is" in text) is turned
+
+
+def test_fixes_in_rad_are_named(tmp_path: Path) -> None:
+    """A converter that forgot the unit: a track of metres, which nothing said."""
+    make, items = Messages(2), []
+    for topic, at, m in drive(make):
+        if topic == "/fix":
+            m.latitude, m.longitude = float(np.radians(m.latitude)), float(np.radians(m.longitude))
+        items.append((topic, at, m))
+    found, config, _ = look(tmp_path, items, make)
+    (line,) = (w for w in found.warnings if "writes rad (57.7" in w)
+    assert line.startswith("/fix: all fixes lie near 1.0070")
+    assert any("gnss: all fixes lie near" in w for w in read_recording(tmp_path / "run", config).warnings)
+    for origin in ((0.0, 0.0), (1.2, 5.0), (57.7, 0.3)):  # a simulator, Sao Tome, Norfolk Sea
+        assert radians_warning("gnss", np.array([[*origin, 0.0]])) == []
 
 
 def test_an_imu_whose_y_is_down_looks_along_z_where_nothing_tells(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from graphloc.app import configured
 from graphloc.config import ImuConfig, VesselConfig
-from graphloc.frontends._clock import gain
+from graphloc.frontends._clock import ClockStep, gain
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import Outcome
@@ -283,3 +283,29 @@ def test_scans_and_images_without_usable_stamps_are_drafted_by_the_recording_tim
     (tmp_path / "vessel.yaml").write_text(draft_config(inspect_bag(path)))
     (sensor,) = (s for s in configured(tmp_path / "vessel.yaml").sensors.values() if s.kind == kind)
     assert sensor.stamps == ("recorded" if recorded else "header")
+
+
+@pytest.mark.parametrize(
+    ("by_s", "said"), [(-18.0, ", as from GPS time to UTC: no"), (18.02, ", as from UTC to GPS time: no"), (-7.0, "")]
+)
+def test_a_clock_that_learns_the_leap_seconds_is_told_so(by_s: float, said: str) -> None:
+    line = ClockStep(by_s, 1_700_000_000 * S).said("/fix")
+    assert f"by {abs(by_s):.2f} s at" in line
+    assert said in line
+    assert said or "GPS time" not in line
+
+
+@pytest.mark.parametrize("learned_s", [20, 45])
+def test_sensors_whose_clock_is_set_are_judged_on_one_side_of_it(learned_s: int, tmp_path: Path) -> None:
+    """GPS time until the receiver learns the leap seconds: some headings and fixes were compared with turns 18 s away, others left out."""
+
+    def learns(ns: int) -> int:
+        return ns + (18 * S if ns < START_NS + learned_s * S else 0)
+
+    seen = []
+    for name, topics in (("set", {"/fix": learns, "/compass": learns}), ("right", {})):
+        (tmp_path / name).mkdir()
+        found, _, _ = look(tmp_path / name, restamped(topics), MAKE)
+        assert any("from GPS time to UTC" in w for w in found.warnings) == (name == "set")
+        seen.append((found.compasses[0].samples, found.imus[0].mount.evidence))
+    assert seen[0] == seen[1]
