@@ -144,16 +144,22 @@ def _turned(
 
 
 def turned_as_its_heading(imu: ImuReport, compasses: Sequence[CompassReport]) -> ImuReport:
-    """Return the report with the mount turned by half where nothing tells its yaw, but its own orientation is half a turn off the course.
+    """Return the report with the mount turned where nothing tells its yaw, but its own orientation says that x is ahead or astern.
 
-    Not by a quarter turn: headings from north, or in other axes than the driver names, are off by that as well.
+    Not by orientations a quarter turn off the course: headings from north, or in other axes than the driver names, are so as well.
     """
-    own = next((c for c in compasses if c.topic == imu.topic and c.backwards), None)
-    if own is None or own.offset_deg is None or imu.mount.yaw_told:
+    own = next((c for c in compasses if c.topic == imu.topic and (c.ahead or c.backwards)), None)
+    if own is None or imu.mount.yaw_told:
         return imu
-    R = np.diag([-1.0, -1.0, 1.0]) @ rotation_from_rpy_deg(np.array(imu.mount.rpy_deg))
-    rpy = vec(np.round(np.degrees(rpy_from_rotation(R)), 1) + 0.0)
-    said = f"{imu.mount.evidence}, but half a turn off that, as its orientation is {own.offset_deg:+.0f} deg off the GNSS course"
+    R = rotation_from_rpy_deg(np.array(imu.mount.rpy_deg))
+    x_deg = float(np.degrees(np.arctan2(R[1, 0], R[0, 0])))
+    quarters = round(((180.0 if own.backwards else 0.0) - x_deg) / 90.0) % 4
+    if quarters == 0:
+        return imu
+    turn = Rotation.from_euler("z", 90.0 * quarters, degrees=True).as_matrix()
+    rpy = vec(np.round(np.degrees(rpy_from_rotation(turn @ R)), 1) + 0.0)
+    turned = "half a turn" if quarters == 2 else "a quarter turn"
+    said = f"{imu.mount.evidence}, but {turned} off that, as its orientation is {own.offset_deg:+.0f} deg off the GNSS course"
     return replace(imu, mount=replace(imu.mount, rpy_deg=rpy, evidence=said, yaw_told=True))
 
 

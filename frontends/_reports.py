@@ -240,6 +240,11 @@ class CompassReport:
     late_s: tuple[float, float] | None = None
 
     @property
+    def ahead(self) -> bool:
+        """Whether it is that of the course, nearly."""
+        return self.usable and self.offset_deg is not None and abs(self.offset_deg) < 180.0 - _ASTERN_DEG
+
+    @property
     def backwards(self) -> bool:
         """Whether it is half a turn off the course, as one that is mounted backwards, or of a vessel that goes astern."""
         return self.usable and self.offset_deg is not None and abs(self.offset_deg) > _ASTERN_DEG

@@ -106,8 +106,9 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
 
     Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. The course is the
     chord's, and what is felt is taken along the chord of the same speeds by the gyroscope: in a turn where the craft brakes, heading
-    and chord differ, and what it feels across would look like a delay. Pitch swings a high antenna along it, so its height (0 m, give or take ten) is estimated with the offset: c is the correlation with what is felt and that swing together. With
-    c at the best offset and c0 at none, N (c^2 - c0^2) / (1 - c^2) is the gain in chi-square over N windows.
+    and chord differ, and what it feels across would look like a delay. Pitch swings a high antenna along it, so its height (0 m,
+    give or take ten) is estimated with the offset: c is the correlation with what is felt and that swing together. With c at the best
+    offset and c0 at none, N (c^2 - c0^2) / (1 - c^2) is the gain in chi-square over N windows.
 
     Args:
         felt: of an IMU in the axes of the vessel. motion: positions, or a velocity over ground.
@@ -180,7 +181,9 @@ def _felt_along(
     course = np.exp(1j * np.interp(at_s + late_s, felt.t_s, felt.turned))
     _, chord = bent(at_s, integral(at_s, speed_mps * course), middle_s, half_s)
     ahead = np.exp(-1j * np.angle(chord))
-    moved, swung = (bent(felt.t_s, way, middle_s + late_s, half_s)[0] for way in (felt.way_m, felt.swing_m))
+    # Straight between measurements, as the motion is.
+    there = (np.interp(at_s + late_s, felt.t_s, way) for way in (felt.way_m, felt.swing_m))
+    moved, swung = (bent(at_s, way, middle_s, half_s)[0] for way in there)
     return (moved * ahead).real, (swung * ahead).real
 
 

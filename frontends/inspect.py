@@ -394,7 +394,10 @@ def _timed_compass(
 def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
     """Return which clocks were set during the run, by topic, unless all were alike: then they are one clock, and what it leaves is a gap."""
     stamped = [s for s in streams if len(s) >= FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED]
-    steps = {s.topic.partition(" ")[0]: step(s.stamps_ns, s.logs_ns) for s in stamped}
+    steps: dict[str, ClockStep | None] = {}
+    for stream in stamped:  # of what comes on one topic, some may come on one side only
+        topic = stream.topic.partition(" ")[0]
+        steps[topic] = steps.get(topic) or step(stream.stamps_ns, stream.logs_ns)
     found = {topic: at for topic, at in steps.items() if at is not None}
     sizes = [at.by_s for at in found.values()]
     if not found or (len(found) == len(steps) and max(sizes) - min(sizes) < GAIN_LIMIT_S):
@@ -405,7 +408,7 @@ def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
 def _as_mostly_set(stream: TopicData, steps: Mapping[str, ClockStep]) -> TopicData:
     """Return the stream with the stamps of before, or after, its clock was set moved to where most are: else it contradicts itself."""
     at = steps.get(stream.topic.partition(" ")[0])
-    if at is None:
+    if at is None or stream.recorded:
         return stream
     after = stream.logs_ns >= at.at_ns
     by_ns = round(at.by_s * NS_PER_S)

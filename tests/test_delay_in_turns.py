@@ -44,3 +44,20 @@ def test_a_delay_is_told_apart_from_turns(late_s: float, turn_deg: float) -> Non
         assert offset is not None
         assert offset.clear == (late_s > 0.0)
         assert offset.value_s == pytest.approx(-late_s, abs=0.08 if offset.clear else 2.0 * offset.sigma_s + 0.05)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.3])
+def test_slow_fixes_tell_a_delay_as_fast_ones_do(late_s: float) -> None:
+    """Fixes every 2 s, between which their motion is straight and what is felt was not: by five sigmas, 0.03 s, off."""
+    rng, t = np.random.default_rng(0), np.arange(0.0, 600.0, 1.0 / RATE_HZ)
+    speed, rate = 3.0 + 1.5 * np.sin(0.4 * t), 0.15 * np.sin(0.2 * t) + 0.02
+    heads, zero = np.exp(1j * integral(t, rate)), np.zeros(len(t))
+    accel = np.column_stack([np.gradient(speed, t), speed * rate, zero + 9.81]) + 0.05 * rng.normal(size=(len(t), 3))
+    at = np.arange(1.0, 599.0, 2.0)
+    fixes = np.interp(at, t, integral(t, speed * heads)) + 0.01 * (rng.normal(size=(2, len(at))).T @ [1.0, 1j])
+    motion = MeasuredMotion("fixes", 0, at + late_s, np.interp(at, t, speed), fixes)
+    felt = Felt.of((t * 1e9).astype(np.int64), accel, np.column_stack([zero, zero, rate]), 9.81)
+    offset = motion_time_offset(felt, motion)
+    assert offset is not None
+    assert offset.clear == (late_s > 0.0)
+    assert offset.value_s == pytest.approx(-late_s, abs=0.015)

@@ -938,6 +938,28 @@ def test_an_imu_whose_y_is_down_looks_along_z_where_nothing_tells(tmp_path: Path
     assert "as in a camera's axes" in text
 
 
+@pytest.mark.parametrize("astern", [False, True], ids=["x ahead", "x astern"])
+def test_an_imu_on_its_side_whose_heading_tells_its_x_is_no_camera(astern: bool, tmp_path: Path) -> None:
+    """Its y is down as in a camera's axes; drafted so, the heading was a quarter turn off, though its own orientation told where x is."""
+    make, rng = Messages(2), np.random.default_rng(2)
+    mount = rotation_z(180.0 if astern else 0.0) @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    driven = drive(make, R_body_sensor=mount)
+    headings = [(at, m.quaternion) for topic, at, m in driven if topic == "/compass"]
+    stamps = np.array([at for at, _ in headings])
+    yaws = np.pi / 2.0 - np.unwrap([2.0 * np.arctan2(q.z, q.w) for _, q in headings])  # of headings from north
+    items = [item for item in driven if item[0] == "/fix"]
+    for _, at, m in (item for item in driven if item[0] == "/imu"):
+        yaw = Rotation.from_euler("z", float(np.interp(at, stamps, yaws))).as_matrix()
+        q = m.orientation
+        q.x, q.y, q.z, q.w = Rotation.from_matrix(yaw @ mount).as_quat().tolist()
+        m.orientation_covariance[0] = 0.01
+        m.linear_acceleration.x, m.linear_acceleration.z = rng.normal(size=2)
+        items.append(("/imu", at, m))
+    found, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert "does not show its yaw" in found.imus[0].mount.evidence
+    np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, mount, atol=1e-6)
+
+
 def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
     make = Messages(2)
     items: list[Item] = []

@@ -33,7 +33,7 @@ from graphloc.frontends._streams import TopicData
 from graphloc.frontends._types import OTHER_TYPES
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import DECODERS, TWIST
-from graphloc.frontends.inspect import draft_config, inspect_bag, render
+from graphloc.frontends.inspect import _read, draft_config, inspect_bag, render
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix
 from tests.bagfactory import Item, Messages, S, write_bag
@@ -451,6 +451,27 @@ def test_two_receivers_on_a_line_stay_two(every: int, apart_ns: int, tmp_path: P
             items.append(("/line", at + apart_ns, make.text(sealed("GP" + gga))))
     seen = inspect_bag(write_bag(tmp_path / "run", make, items))
     assert [g.topic for g in seen.gnss] == ["/line GNGGA", "/line GPGGA"]
+
+
+def test_a_clock_of_a_line_is_set_though_one_sentence_comes_later_and_one_has_no_stamps_of_its_own(
+    tmp_path: Path,
+) -> None:
+    """Headings from after it hid that it was set; places of whole seconds, taken by their recording times, were moved as well."""
+    make, items = Messages(2), [item for item in drive(Messages(2), seconds=60) if item[0] == "/imu"]
+    make.register("std_msgs/Header header\nstring sentence", SENTENCE)
+    first = items[0][1]
+    for k in range(600):
+        logged = first + k * S // 10
+        stamp = logged + (18 * S if k < 400 else 0)
+        bodies = {f"GPVTG,0.00,T,,M,{9.0 + 0.001 * k:.3f},N,16.668,K,A": stamp}
+        bodies |= {f"GPGGA,120000.00,{ahead(k // 2, 2.5)},4,12,0.8,41.5,M,36.5,M,,": stamp // S * S}
+        bodies |= {f"HEHDT,{0.01 * k:.3f},T": stamp} if k > 450 else {}
+        for body, at in bodies.items():
+            items.append(("/nmea", logged, make.t[SENTENCE](header=make.header(at, "gps"), sentence=sealed(body))))
+    bag = _read(write_bag(tmp_path / "run", make, sorted(items, key=lambda item: item[1])))
+    assert any("/nmea was set back by 18.00 s" in said for said in bag.warnings)
+    places = bag.aligned["/nmea GPGGA"]
+    np.testing.assert_array_equal(places.stamps_ns, places.logs_ns)
 
 
 def test_two_receivers_that_are_recorded_to_the_second_stay_two(tmp_path: Path) -> None:
