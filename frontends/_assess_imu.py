@@ -46,6 +46,7 @@ _QUIET_S, _STANDS_S = 2, 1.5
 _TILTED_DEG, _QUARTER_DEG, _OVERRULES = 20.0, 20.0, 0.6
 _SLIGHTLY_DEG = 3.0  # off a quarter turn, from which it is said
 _ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, or an antenna far ahead, make less
+_AHEAD_DEG = 60.0  # off its x, within which a hint says that this is ahead rather than astern or aside
 _CAMERA = -0.7  # of gravity along y, below which its axes are a camera's
 _ON_ITS_HEAD = -0.7  # of gravity along z, below which a sensor is so, however it is tilted
 
@@ -191,8 +192,9 @@ def _mount_yaw(
     if found is None:
         return None, "too little motion to find its yaw from"
     quarter = 90.0 * round(found.yaw_deg / 90.0)
-    if not found.clear and found.likely:
-        yaw = float(np.degrees(wrap_angle(np.radians(quarter)))) + 0.0
+    stays = found.hints and abs(found.yaw_deg) < _AHEAD_DEG
+    if not found.clear and (found.likely or stays):
+        yaw = float(np.degrees(wrap_angle(np.radians(quarter)))) + 0.0 if found.likely else 0.0
         said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg, but not clearly (coherence {found.coherence:.2f})"
         return yaw, f"{said}: taken as {yaw:.0f}"
     if not found.clear:

@@ -26,6 +26,7 @@ STEP_S = 0.5  # between two times at which it is asked
 FEWEST, MOVES_M = 20, 1.0  # windows; a shorter way has no direction
 _MIN_COHERENCE, _CLEAR = 0.25, 4.0  # and so many times what chance gives
 _LIKELY_COHERENCE, _LIKELY = 0.5, 3.0  # the same, to choose between quarter turns: chance gives it once in 8000
+_HINT = 2.0  # the same, to leave a sensor where it is: chance gives it once in 200
 _WAVES_S = 20.0  # the longest that tilt it
 _NEARLY = 0.9  # as long as from one measurement to the next, whose stamps may be uneven
 _ASTRAY_DEG = 30.0  # leeway, or an antenna far ahead, make less
@@ -49,6 +50,11 @@ class YawInCraft:
     def likely(self) -> bool:
         """Whether it tells which quarter turn is the likeliest."""
         return self.coherence >= max(_LIKELY_COHERENCE, _LIKELY * self.chance)
+
+    @property
+    def hints(self) -> bool:
+        """Whether chance seldom has it: not enough to turn a sensor by, but to leave it where it is."""
+        return self.coherence >= _HINT * self.chance
 
     @property
     def sigma_deg(self) -> float:

@@ -314,6 +314,17 @@ def test_a_quay_without_an_end_in_view_says_nothing_along_itself(turned_deg: flo
     assert np.sqrt(ahead @ mode.cov[:2, :2] @ ahead) < 0.5
 
 
+def test_what_chance_makes_of_a_ridge_does_not_grow_beyond_what_was_measured() -> None:
+    """A pole on a wall, 13 nats: in a window of 52 m chance was taken to make 18, and no place was left."""
+    g = grid(104)
+    yaw, north, east = np.meshgrid(g.yaw_rad, g.north_m, g.east_m, indexing="ij")
+    wall = 25.0 - 0.5 * (north / 0.25) ** 2 - 0.5 * (yaw / np.radians(0.6)) ** 2
+    pole = wall + 13.0 * np.exp(-0.5 * ((east - 3.0) / 0.4) ** 2)
+    (mode, *_), _ = modes_of(pole.astype(np.float32), g, 5.0, 0.05, normals=np.diag([0.05, 0.95]))
+    assert mode.pose[0] == pytest.approx(3.0, abs=0.1)
+    assert np.sqrt(mode.cov[0, 0]) < 1.0
+
+
 def test_normals_are_those_of_the_lines_in_view() -> None:
     """Of two walls along a canal, to its left and right at 31 deg; then with one across it, and of poles alone."""
     a = np.radians(31.0)

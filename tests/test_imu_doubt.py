@@ -4,7 +4,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import gtsam
@@ -26,7 +26,7 @@ from graphloc.online._lag import Lag
 from graphloc.online._tracking import Tracking
 from graphloc.recording import Recording, quiet
 from graphloc.solution import Health, Solution
-from graphloc.solve import _first_solution
+from graphloc.solve import _first_solution, _wrong_imu
 from graphloc.solve._start import Begun
 from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
 from tests.slowly import slowly
@@ -113,14 +113,16 @@ def test_sensors_that_no_motion_explains_are_not_believed_against_the_imu(change
     assert not [r for r in fed.rows if r.sensor == "imu" and r.outcome is Outcome.REJECTED]
 
 
-@pytest.mark.parametrize("guard", ["_MOTION", "_EXPLAINED"])
+@pytest.mark.parametrize(
+    ("where", "guard", "value"), [(_wrong_imu, "_MOTION", 0.0), (_lag, "_EXPLAINED", 1.1)], ids=["motion", "explained"]
+)
 def test_it_is_left_out_only_where_a_motion_of_a_vessel_explains_the_denials(
-    guard: str, monkeypatch: pytest.MonkeyPatch
+    where: ModuleType, guard: str, value: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No motion is quiet enough, or no share of what denied large enough: then the estimate of the IMU stands."""
     arrivals = changed(axes_swapped)
     arrivals = arrivals[: at_s(arrivals, 15.5)]
-    monkeypatch.setattr(_lag, guard, {"_MOTION": 0.0, "_EXPLAINED": 1.1}[guard])
+    monkeypatch.setattr(where, guard, value)
     online = smoother(run_of())
     assert blamed(feed(online, run_of(), arrivals)) == 0
 

@@ -914,6 +914,29 @@ def test_an_imu_that_no_motion_turns_is_turned_as_its_own_heading(turned: bool, 
     assert ("as its orientation is" in text) is turned
 
 
+def test_an_imu_whose_motion_hints_at_its_mount_is_not_turned_by_its_own_heading(tmp_path: Path) -> None:
+    """Ahead, as what it feels says in spite of an engine, and its heading is half a turn off: it was turned, and the heading with it."""
+    make, rng = Messages(2), np.random.default_rng(2)
+    driven = drive(make)
+    headings = [(at, m.quaternion) for topic, at, m in driven if topic == "/compass"]
+    stamps = np.array([at for at, _ in headings])
+    yaws = np.pi / 2.0 - np.unwrap([2.0 * np.arctan2(q.z, q.w) for _, q in headings])  # of headings from north
+    items = [item for item in driven if item[0] == "/fix"]
+    for _, at, m in (item for item in driven if item[0] == "/imu"):
+        half = 0.5 * (float(np.interp(at, stamps, yaws)) + np.pi)
+        m.orientation.z, m.orientation.w = np.sin(half), np.cos(half)
+        m.orientation_covariance[0] = 0.01
+        shaken = rng.normal(0.0, 8.0, 2)
+        m.linear_acceleration.x, m.linear_acceleration.y = (
+            m.linear_acceleration.x + shaken[0],
+            m.linear_acceleration.y + shaken[1],
+        )
+        items.append(("/imu", at, m))
+    found, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert "but not clearly" in found.imus[0].mount.evidence
+    assert config.sensors["imu"].mount.rpy_deg[2] == 0.0
+
+
 def test_fixes_in_rad_are_named(tmp_path: Path) -> None:
     """A converter that forgot the unit: a track of metres, which nothing said."""
     make, items = Messages(2), []

@@ -21,7 +21,7 @@ _LEAST_SHARE = 0.01  # of the posterior that a mode must have
 _NARROW, _FINER = 5, 5  # a mode of fewer cells across is looked at between them, so much finer
 _FLOOR = np.array([0.05, 0.05, np.radians(0.1)])  # m, rad: no image tells more
 # A ridge through all of the window that falls by less than so many nats, times the root of its length in m, says nothing along itself.
-_CHANCE = 2.5
+_CHANCE, _MEASURED_M = 2.5, 13.0  # of longer windows it was not measured: no more is asked there
 _UNTOLD_M = 20.0  # 1 sigma along it; less would say the window itself, match after match
 _ACROSS_M = 0.6  # half width of a ridge, around its line
 _RIDGE_STEP_DEG = 3.0
@@ -183,7 +183,7 @@ def _open_along(profile: NDArray[np.float32], spot: NDArray[np.int64], height: f
     long = within.sum(axis=1)  # a peak near a corner has short lines
     falls = np.where(long >= 0.9 * size.min(), height - lowest, np.inf)
     best = int(np.argmin(falls))
-    return along[best] if falls[best] < _CHANCE * np.sqrt(long[best] * cell_m) else None
+    return along[best] if falls[best] < _CHANCE * np.sqrt(min(long[best] * cell_m, _MEASURED_M)) else None
 
 
 def _told(along: Array, normals: Array, yaw_rad: float) -> float:
