@@ -893,22 +893,28 @@ def test_an_ins_that_tells_its_speed_is_no_wheels(frame: str, tmp_path: Path) ->
         )
 
 
-@pytest.mark.parametrize("turned", [True, False], ids=["half a turn", "a quarter turn"])
-def test_an_imu_that_no_motion_turns_is_turned_as_its_own_heading(turned: bool, tmp_path: Path) -> None:
-    """Hand-held, by a gait that hides what turns feel like: taken as ahead, the solved heading was 177 deg off."""
-    make, offset = Messages(2), np.pi if turned else np.pi / 2.0
-    driven, rng = drive(make, R_body_sensor=rotation_z(180.0)), np.random.default_rng(2)
+def oriented(driven: list[Item], R_ahead_sensor: Array) -> list[Item]:
+    """Return the fixes and the IMU of a drive, which tells its own orientation, turned so from axes ahead, to port, up."""
     headings = [(at, m.quaternion) for topic, at, m in driven if topic == "/compass"]
     stamps = np.array([at for at, _ in headings])
     yaws = np.pi / 2.0 - np.unwrap([2.0 * np.arctan2(q.z, q.w) for _, q in headings])  # of headings from north
-    items = [item for item in driven if item[0] == "/fix"]
-    for _, at, m in (item for item in driven if item[0] == "/imu"):
-        half = 0.5 * (float(np.interp(at, stamps, yaws)) + offset)
-        m.orientation.z, m.orientation.w = np.sin(half), np.cos(half)
+    items = [item for item in driven if item[0] in ("/fix", "/imu")]
+    for _, at, m in (item for item in items if item[0] == "/imu"):
+        yaw = Rotation.from_euler("z", float(np.interp(at, stamps, yaws))).as_matrix()
+        q = m.orientation
+        q.x, q.y, q.z, q.w = Rotation.from_matrix(yaw @ R_ahead_sensor).as_quat().tolist()
         m.orientation_covariance[0] = 0.01
+    return sorted(items, key=lambda item: item[1])
+
+
+@pytest.mark.parametrize("turned", [True, False], ids=["half a turn", "a quarter turn"])
+def test_an_imu_that_no_motion_turns_is_turned_as_its_own_heading(turned: bool, tmp_path: Path) -> None:
+    """Hand-held, by a gait that hides what turns feel like: taken as ahead, the solved heading was 177 deg off."""
+    make, rng = Messages(2), np.random.default_rng(2)
+    items = oriented(drive(make, R_body_sensor=rotation_z(180.0)), rotation_z(180.0 if turned else 90.0))
+    for m in (m for topic, _, m in items if topic == "/imu"):
         m.linear_acceleration.x, m.linear_acceleration.y = rng.normal(size=2)
-        items.append(("/imu", at, m))
-    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    found, config, text = look(tmp_path, items, make)
     assert "does not show its yaw" in found.imus[0].mount.evidence
     assert config.sensors["imu"].mount.rpy_deg == (0.0, 0.0, 180.0 if turned else 0.0)
     assert ("as its orientation is" in text) is turned
@@ -917,22 +923,11 @@ def test_an_imu_that_no_motion_turns_is_turned_as_its_own_heading(turned: bool, 
 def test_an_imu_whose_motion_hints_at_its_mount_is_not_turned_by_its_own_heading(tmp_path: Path) -> None:
     """Ahead, as what it feels says in spite of an engine, and its heading is half a turn off: it was turned, and the heading with it."""
     make, rng = Messages(2), np.random.default_rng(2)
-    driven = drive(make)
-    headings = [(at, m.quaternion) for topic, at, m in driven if topic == "/compass"]
-    stamps = np.array([at for at, _ in headings])
-    yaws = np.pi / 2.0 - np.unwrap([2.0 * np.arctan2(q.z, q.w) for _, q in headings])  # of headings from north
-    items = [item for item in driven if item[0] == "/fix"]
-    for _, at, m in (item for item in driven if item[0] == "/imu"):
-        half = 0.5 * (float(np.interp(at, stamps, yaws)) + np.pi)
-        m.orientation.z, m.orientation.w = np.sin(half), np.cos(half)
-        m.orientation_covariance[0] = 0.01
-        shaken = rng.normal(0.0, 8.0, 2)
-        m.linear_acceleration.x, m.linear_acceleration.y = (
-            m.linear_acceleration.x + shaken[0],
-            m.linear_acceleration.y + shaken[1],
-        )
-        items.append(("/imu", at, m))
-    found, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    items = oriented(drive(make), rotation_z(180.0))
+    for m in (m for topic, _, m in items if topic == "/imu"):
+        felt, shaken = m.linear_acceleration, rng.normal(0.0, 8.0, 2)
+        felt.x, felt.y = felt.x + shaken[0], felt.y + shaken[1]
+    found, config, _ = look(tmp_path, items, make)
     assert "but not clearly" in found.imus[0].mount.evidence
     assert config.sensors["imu"].mount.rpy_deg[2] == 0.0
 
@@ -966,19 +961,10 @@ def test_an_imu_on_its_side_whose_heading_tells_its_x_is_no_camera(astern: bool,
     """Its y is down as in a camera's axes; drafted so, the heading was a quarter turn off, though its own orientation told where x is."""
     make, rng = Messages(2), np.random.default_rng(2)
     mount = rotation_z(180.0 if astern else 0.0) @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    driven = drive(make, R_body_sensor=mount)
-    headings = [(at, m.quaternion) for topic, at, m in driven if topic == "/compass"]
-    stamps = np.array([at for at, _ in headings])
-    yaws = np.pi / 2.0 - np.unwrap([2.0 * np.arctan2(q.z, q.w) for _, q in headings])  # of headings from north
-    items = [item for item in driven if item[0] == "/fix"]
-    for _, at, m in (item for item in driven if item[0] == "/imu"):
-        yaw = Rotation.from_euler("z", float(np.interp(at, stamps, yaws))).as_matrix()
-        q = m.orientation
-        q.x, q.y, q.z, q.w = Rotation.from_matrix(yaw @ mount).as_quat().tolist()
-        m.orientation_covariance[0] = 0.01
+    items = oriented(drive(make, R_body_sensor=mount), mount)
+    for m in (m for topic, _, m in items if topic == "/imu"):
         m.linear_acceleration.x, m.linear_acceleration.z = rng.normal(size=2)
-        items.append(("/imu", at, m))
-    found, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    found, config, _ = look(tmp_path, items, make)
     assert "does not show its yaw" in found.imus[0].mount.evidence
     np.testing.assert_allclose(config.sensors["imu"].mount.R_body_sensor, mount, atol=1e-6)
 
