@@ -23,7 +23,6 @@ from graphloc.factors._noise import with_floors
 from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import BodyVelocity
-from graphloc.thinning import LEAST_APART_NS
 
 _CURRENT, _OFF, _TURNED = slice(1, 3), slice(3, 6), 6  # after the scale error, in a slow state that has all
 _Z = skew(np.array([0.0, 0.0, 1.0]))
@@ -127,5 +126,4 @@ ROW = Sensor(
     slow=slow,
     company=True,
     along_body=True,
-    apart_ns=LEAST_APART_NS,
 )

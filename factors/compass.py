@@ -25,7 +25,6 @@ from graphloc.config import CompassConfig
 from graphloc.frames import Array, Datum, skew, wrap_angle
 from graphloc.graph import Attachment, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import CompassHeading
-from graphloc.thinning import LEAST_APART_NS
 
 _FLOOR_RAD = np.radians(0.05)  # no compass is better, whatever it says
 _DEVIATION = ("B", "C", "D", "E")
@@ -131,5 +130,4 @@ ROW = Sensor(
     ideal=ideal,
     hint=hint,
     slow=slow,
-    apart_ns=LEAST_APART_NS,
 )

@@ -31,7 +31,7 @@ from graphloc.imu_spikes import WHY as SPIKE
 from graphloc.imu_spikes import spike_warning, spikes
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
-from graphloc.thinning import LEAST_APART_NS, THINNED, Thinning
+from graphloc.thinning import THINNED, Thinning
 from graphloc.time import NS_PER_S, utc_text
 
 
@@ -288,9 +288,9 @@ def thin(readings: Readings) -> list[LedgerRow]:
 
     Only what is in order of its stamps is dropped, evenly.
     """
-    if not isinstance(readings.config, (CompassConfig, BodyVelocityConfig)):
+    if not readings.config.apart_ns:
         return []
-    thinning = Thinning(LEAST_APART_NS)
+    thinning = Thinning(readings.config.apart_ns)
     bad = np.array([thinning.drops(stamp_ns) for stamp_ns in readings.stamps_ns], dtype=bool)
     return readings.drop(bad, rejected(THINNED))
 

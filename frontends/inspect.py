@@ -209,8 +209,9 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     imus = [_in_turned_body(imu) for imu in imus] if down else imus
     felt = felt_of(bag.aligned[imus[0].topic], imus[0], tree, body) if imus else None
     compasses = _compass_reports(bag, imus, felt.turning if felt else None, courses)
-    imus = [turned_as_its_heading(imu, compasses) for imu in imus]
-    felt = felt_of(bag.aligned[imus[0].topic], imus[0], tree, body) if imus else None
+    taken, imus = imus, [turned_as_its_heading(imu, compasses) for imu in imus]
+    if imus and imus[0] is not taken[0]:
+        felt = felt_of(bag.aligned[imus[0].topic], imus[0], tree, body)
     late = {motion.source: motion_time_offset(felt, motion) for motion in motions} if felt else {}
     used = {g.topic for g in gnss} | {i.topic for i in imus} | {c.topic for c in compasses if c.usable}
     reports = [report for _, report in odometry]

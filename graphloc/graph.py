@@ -359,7 +359,6 @@ class Sensor:
         company: whether it can tell another sensor's slow error from motion.
         in_world: whether it is given in world coordinates, so that the datum must be known.
         along_body: whether it measures motion along the body's axes: with positions, that tells the heading.
-        apart_ns: measurements of a sensor that follow the one before within less tell nothing new, and are left out.
     """
 
     kind: str
@@ -381,7 +380,6 @@ class Sensor:
     company: bool = False
     in_world: bool = False
     along_body: bool = False
-    apart_ns: int = 0
 
     def of(self, config: SensorConfig) -> Sensor:
         """Return the row of a sensor that is configured so: poses of height or heading alone are no positions, and no company."""

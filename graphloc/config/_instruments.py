@@ -14,6 +14,7 @@ from pydantic import Field, field_validator
 
 from graphloc.blocks import Block, Finite, NonNegative, Positive
 from graphloc.config._sensor import KernelConfig, SensorConfig
+from graphloc.thinning import LEAST_APART_NS
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 
@@ -187,6 +188,10 @@ class CompassConfig(SensorConfig):
     nmea: Headings = ("HDT", "THS")
     """NMEA sentences to read, from one talker (`HEHDT`) or any (`HDT`): HDT, THS, HDG, HDM."""
 
+    @property
+    def apart_ns(self) -> int:
+        return LEAST_APART_NS
+
 
 class VelocityConfig(SensorConfig):
     """GNSS velocity over ground (`geometry_msgs/TwistWithCovarianceStamped`, `TwistStamped`, `Vector3Stamped`, NMEA and GPSFix as `gnss`)."""
@@ -247,6 +252,10 @@ class BodyVelocityConfig(SensorConfig):
     @classmethod
     def _ordered(cls, axes: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(axis for axis in "xyz" if axis in axes)
+
+    @property
+    def apart_ns(self) -> int:
+        return LEAST_APART_NS
 
 
 class HeightConfig(SensorConfig):

@@ -95,6 +95,11 @@ class SensorConfig(Block):
         return False
 
     @property
+    def apart_ns(self) -> int:
+        """Measurements that follow the one before within less tell nothing new, and are left out (`graphloc.thinning`)."""
+        return 0
+
+    @property
     def synthetic_every_s(self) -> float:
         """Time between two of the measurements that the configuration makes itself (`Sensor.synthetic`), s."""
         return 1.0

@@ -65,8 +65,7 @@ class Setup:
     @cached_property
     def apart_ns(self) -> dict[str, int]:
         """Of each of these, how close to the one before a measurement tells nothing new."""
-        kinds = {row.kind: row.apart_ns for row in self.rows}
-        return {name: kinds[self.config.sensors[name].kind] for name in self.measuring}
+        return {name: self.config.sensors[name].apart_ns for name in self.measuring}
 
     @cached_property
     def absolute(self) -> tuple[str, ...]:
