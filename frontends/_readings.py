@@ -284,7 +284,7 @@ def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
 
 
 def thin(readings: Readings) -> list[LedgerRow]:
-    """Drop headings and velocities along the body that come faster than their errors change: each costs time, and at 500 Hz memory.
+    """Drop fixes, velocities and headings that come faster than their errors change: each costs time, and at 500 Hz memory.
 
     Only what is in order of its stamps is dropped, evenly.
     """

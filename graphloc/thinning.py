@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 LEAST_APART_NS = 45_000_000
-"""Between two headings, or two velocities along the body, that are used: 20 a second stay, though steps between their stamps are up to 5 ms short."""
+"""Between two fixes, velocities or headings of a sensor that are used: 20 a second stay, though steps between their stamps are up to 5 ms short."""
 THINNED = "less than 0.05 s after the one before: what it errs lasts longer, so that it tells nothing new"
 
 

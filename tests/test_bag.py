@@ -31,7 +31,7 @@ from graphloc.frames import Datum
 from graphloc.frontends._source import Bag
 from graphloc.frontends.bag import read_recording
 from graphloc.ledger import Ledger, Outcome
-from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition
+from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity
 from graphloc.recording import Recording
 from graphloc.thinning import THINNED
 from tests.bagfactory import START_NS, Messages, S, still_run, write_bag
@@ -444,14 +444,20 @@ def test_headings_that_come_faster_than_a_compass_errs_are_thinned(rate_hz: int,
     assert accounted(recording) == recording.message_count
 
 
-def test_wheels_faster_than_they_err_anew_are_thinned(tmp_path: Path) -> None:
-    """At 100 Hz each would be a factor of the graph: every fifth is used, and the others have rows."""
+@pytest.mark.parametrize(
+    ("kind", "measured"), [("body_velocity", BodyVelocity), ("gnss_velocity", GnssVelocity), ("gnss", GnssPosition)]
+)
+def test_what_is_faster_than_it_errs_anew_is_thinned(
+    kind: str, measured: type[BodyVelocity | GnssVelocity | GnssPosition], tmp_path: Path
+) -> None:
+    """Wheels, or another filter's output, at 100 Hz would each be a factor of the graph: every fifth is used, and the others have rows."""
     make, items = Messages(2), []
     for k in range(300):
         at_ns = START_NS + k * S // 100
-        items += [("/imu", at_ns, make.imu(at_ns)), ("/odom", at_ns, make.odometry(at_ns, v=(1.0, 0.0, 0.0)))]
+        said = make.fix(at_ns, 57.7 + 1e-7 * k) if kind == "gnss" else make.twist(at_ns, (1.0, 0.0, 0.0))
+        items += [("/imu", at_ns, make.imu(at_ns)), ("/fast", at_ns, said)]
     bag = write_bag(tmp_path / "run", make, items, "mcap")
-    recording = read_recording(bag, vessel(gnss=None, wheels={"kind": "body_velocity", "topic": "/odom"}))
-    assert [m.stamp_ns for m in recording.of(BodyVelocity)] == [START_NS + k * S // 20 for k in range(60)]
-    reasons = [(row.outcome, row.reason) for row in recording.rows if row.sensor == "wheels"]
+    recording = read_recording(bag, vessel(gnss=None, fast={"kind": kind, "topic": "/fast"}))
+    assert [m.stamp_ns for m in recording.of(measured)] == [START_NS + k * S // 20 for k in range(60)]
+    reasons = [(row.outcome, row.reason) for row in recording.rows if row.sensor == "fast"]
     assert reasons == 240 * [(Outcome.REJECTED, THINNED)]

@@ -563,11 +563,11 @@ def test_memory_does_not_grow() -> None:
     assert grown == {}
 
 
-def test_headings_faster_than_a_compass_errs_anew_are_thinned() -> None:
-    """Each heading said again 10, 20 and 30 ms later: as if it were said once, with a row for each."""
+def test_headings_and_fixes_faster_than_they_err_anew_are_thinned() -> None:
+    """Each heading and fix said again 10, 20 and 30 ms later: as if it were said once, with a row for each."""
     more: Arrivals = []
     for a in arrivals_of(drift()):
-        later = (10, 20, 30) if isinstance(a.m, CompassHeading) else ()
+        later = (10, 20, 30) if isinstance(a.m, CompassHeading | GnssPosition) else ()
         more += [
             a,
             *(
@@ -579,7 +579,7 @@ def test_headings_faster_than_a_compass_errs_anew_are_thinned() -> None:
     assert complaints(more, fed) == []
     once, _ = in_order()
     thinned = [row for row in fed.rows if row.reason == THINNED]
-    assert len(thinned) == 3 * sum(isinstance(a.m, CompassHeading) for a in arrivals_of(drift()))
+    assert len(thinned) == 3 * sum(isinstance(a.m, CompassHeading | GnssPosition) for a in arrivals_of(drift()))
     assert {row.outcome for row in thinned} == {Outcome.REJECTED}
     np.testing.assert_allclose(fed.errors_m, once.errors_m, atol=1e-9)
 

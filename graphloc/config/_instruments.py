@@ -162,6 +162,10 @@ class GnssConfig(SensorConfig):
         """It does where the other fixes are another sensor's."""
         return self.fixes != "any"
 
+    @property
+    def apart_ns(self) -> int:
+        return LEAST_APART_NS
+
 
 class CompassConfig(SensorConfig):
     """Heading: `geometry_msgs/QuaternionStamped`, orientation of `sensor_msgs/Imu`, NMEA (as `gnss`), `std_msgs/Float64` or `Float32`."""
@@ -211,6 +215,10 @@ class VelocityConfig(SensorConfig):
     """Unknown error of where its antenna is taken to sit, 1 sigma, each axis, m; as that of `gnss`."""
     nmea: Velocities = ("VTG",)
     """NMEA sentences to read, from one talker (`GPVTG`) or any (`VTG`): VTG, RMC."""
+
+    @property
+    def apart_ns(self) -> int:
+        return LEAST_APART_NS
 
 
 class BodyVelocityConfig(SensorConfig):
