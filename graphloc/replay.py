@@ -248,7 +248,7 @@ def _timed(happened: Sequence[tuple[int, Event]], estimates: Sequence[Estimate])
             )
             line += (
                 f"; it stays so {until} ({(last_ns - max(stamp_ns, begin_ns)) / 1e9:.0f} s) and is not rated good; use a "
-                "compass, a dual antenna or start.heading_deg"
+                "compass, a dual antenna, wheels or a log (body_velocity), or start.heading_deg"
             )
         timed.append(event._replace(text=line))
     return timed

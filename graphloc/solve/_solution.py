@@ -188,7 +188,9 @@ def _add_others(result: BatchResult, cov: Array) -> list[str]:
     if sure < _SHOWN_RAD:
         return []
     said = f"the heading is a guess: no sensor tells it, and the motion only to {np.degrees(sure):.0f} deg (1 sigma) at best"
-    return [f"{said}; turn or accelerate more, add a heading sensor or set start.heading_deg"]
+    return [
+        f"{said}; turn or accelerate more, add a heading sensor, wheels or a log (body_velocity), or set start.heading_deg"
+    ]
 
 
 def _add_guess(result: BatchResult, cov: Array) -> list[str]:
