@@ -475,7 +475,7 @@ def _wheels_block(name: str, item: OdometryReport) -> list[str]:
     turned = ["  mount: {rpy_deg: [0.0, 0.0, 180.0]}  # guess: its sign looks wrong"] if item.reverse else []
     return [
         f"{name}:", "  kind: body_velocity", f"  topic: {item.topic}",
-        "  enabled: false  # guess: true to fuse it, if held-out fixes are predicted no worse (fix_rmse_m); then delete check_speed_topic",
+        "  enabled: false  # guess: true to fuse it (it tells the heading, too), if held-out fixes are predicted no worse (fix_rmse_m); then delete check_speed_topic",
         "  axes: [x, y]  # guess: wheels do not slip sideways; x alone tells the heading by its cosine only, and may not converge",
         *turned,
         *_UNKNOWN_MOUNT,
