@@ -406,7 +406,9 @@ def gps_fix_velocity_mps(msg: Any) -> tuple[float, float, float] | Rejection:
     speed, track, climb = float(msg.speed), float(msg.track), float(msg.climb)
     if not isfinite(speed) or (speed > nmea.SLOW_MPS and not isfinite(track)):
         return rejected(f"no {'track' if isfinite(speed) else 'speed'}")
-    angle = np.radians(track if isfinite(track) else 0.0)
+    if not isfinite(track):
+        return 0.0, 0.0, climb or np.nan
+    angle = np.radians(track)
     return float(speed * np.sin(angle)), float(speed * np.cos(angle)), climb or np.nan
 
 

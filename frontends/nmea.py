@@ -28,7 +28,7 @@ _UNREADABLE = (
 )  # fmt: skip
 KNOT_MPS, KM_PER_H_MPS = 1852.0 / 3600.0, 1.0 / 3.6
 SLOW_MPS = 0.1
-"""Below it a receiver may leave the course out."""
+"""Up to it a receiver may leave the course out: the velocity is then zero. Taken for a course of 0, its noise is a drift to the north."""
 # Quality of a fix as GGA has it, from the mode letters of GNS, RMC and GLL.
 _QUALITIES = {"N": 0, "A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
 _NOT_MEASURED = {0: "no fix", 6: "dead reckoned by the receiver", 7: "typed in by hand", 8: "simulated by the receiver"}
@@ -107,8 +107,8 @@ def velocity_mps(text: str, wanted: Collection[str]) -> tuple[float, float] | Re
         speed, course = _speed_mps(said, "sogn", "sogk"), _number(said, "cogt")
     if not isfinite(speed) or (speed > SLOW_MPS and not isfinite(course)):
         return rejected(f"{said.msgID}: no {'course' if isfinite(speed) else 'speed'}")
-    east = radians(course if isfinite(course) else 0.0)
-    return speed * sin(east), speed * cos(east)
+    east = radians(course)
+    return (speed * sin(east), speed * cos(east)) if isfinite(course) else (0.0, 0.0)
 
 
 def water_speed_mps(text: str, wanted: Collection[str]) -> float | Rejection:

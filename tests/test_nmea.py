@@ -90,7 +90,7 @@ def test_headings_are_clockwise_from_north(body: str, deg: float) -> None:
     ("body", "east_mps", "north_mps"),
     [("GPVTG,090.0,T,,M,010.0,N,018.5,K,A", 10.0 * 1852.0 / 3600.0, 0.0),
      ("GPVTG,180.0,T,,M,,N,036.0,K", 0.0, -10.0),
-     ("GPVTG,,T,,M,0.01,N,0.02,K,D", 0.0, 0.01 * 1852.0 / 3600.0),  # at rest there is no course
+     ("GPVTG,,T,,M,0.18,N,0.33,K,D", 0.0, 0.0),  # at rest there is no course: noise, which is not to the north
      ("GPRMC,122310.2,A,3722.425671,N,12258.856215,W,10.0,270.0,230324,,,A", -10.0 * 1852.0 / 3600.0, 0.0)],
 )  # fmt: skip
 def test_velocities_are_east_and_north(body: str, east_mps: float, north_mps: float) -> None:
@@ -546,6 +546,14 @@ def test_a_gps_fix_without_a_speed_tells_no_velocity() -> None:
         found = DECODERS["gnss_velocity", "gps_msgs/msg/GPSFix"](fix, S, 0, "v", VelocityConfig())
         assert isinstance(found, Rejection)
         assert why in found.reason
+
+
+def test_a_gps_fix_at_rest_without_a_track_stands() -> None:
+    """Its speed is noise, to all sides; taken for a track of 0, a receiver at rest moved north by 5 cm/s."""
+    fix = gps_fix(Messages(2), S, 57.7, 11.9, speed=0.09, track=float("nan"))
+    found = DECODERS["gnss_velocity", "gps_msgs/msg/GPSFix"](fix, S, 0, "v", VelocityConfig())
+    assert isinstance(found, GnssVelocity)
+    assert found.v_world_mps[:2] == pytest.approx((0.0, 0.0))
 
 
 def test_a_climb_that_the_driver_leaves_at_0_is_none() -> None:
