@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
@@ -305,8 +306,8 @@ class TopicData:
         return len(self._stamps)
 
 
-def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
-    """Read all topics of the types in `ROWS` and `VENDORS`, and the static transforms.
+def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree, dict[str, Counter[str]]]:
+    """Read all topics of the types in `ROWS` and `VENDORS`, the static transforms, and by topic how many sentences of NMEA nothing reads.
 
     An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type; 'TOPIC GPGGA+GNGGA' of a
     receiver that changes its talker. RMC gives another one of velocities, named 'TOPIC GPRMC (course, speed)', where it holds any and no
@@ -314,14 +315,14 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
     velocities through water are one named 'TOPIC (through water)', what a filter made one named 'TOPIC (of a filter)'.
     """
     streams, tree = _empty_streams(bag), StaticTree()
-    _fill(streams, tree, bag)
+    unread = _fill(streams, tree, bag)
     tree.settle()
     _join_talkers(streams)
     for name in _of_no_use(streams):
         del streams[name]
     for stream in streams.values():
         stream.settle()
-    return [_named_as_filters(stream) for stream in streams.values()], tree
+    return [_named_as_filters(stream) for stream in streams.values()], tree, unread
 
 
 def _empty_streams(bag: Bag) -> dict[str, TopicData]:
@@ -342,8 +343,9 @@ def _empty_streams(bag: Bag) -> dict[str, TopicData]:
     return streams
 
 
-def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> None:
-    """Read the messages of a bag into streams and transforms, in place."""
+def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> dict[str, Counter[str]]:
+    """Read the messages of a bag into streams and transforms, in place; return how many sentences of a topic are not read."""
+    unread: dict[str, Counter[str]] = {}
     mixed = {t.topic for t in bag.topics.values() if len(t.msgtypes) == 1 and t.msgtypes[0] in NMEA}
     wanted = set(streams) | mixed | ({TF_STATIC, TF_MOVING} & set(bag.topics))
     for raw in bag.messages(wanted) if wanted else ():
@@ -354,12 +356,15 @@ def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> None:
         try:
             msg = bag.decode(raw)
             said = _sentences(raw.topic, msg, streams) if raw.topic in mixed else _plain(raw, msg, streams)
+            if raw.topic in mixed:
+                unread.setdefault(raw.topic, Counter()).update(nmea.unread(nmea.text_of(msg)))
         except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything; counted
             said = [(streams[raw.topic], None)] if raw.topic in streams else []
         if raw.topic == TF_STATIC:
             tree.take(raw.msgtype, msg)
         for stream, row in said:
             _add(stream, row, raw, msg)
+    return unread
 
 
 def _add(stream: TopicData, row: Row | None, raw: RawMessage, msg: Any) -> None:

@@ -22,6 +22,8 @@ VELOCITIES = ("VTG", "RMC")
 SPEEDS = ("VHW",)
 _SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # tag blocks before it are left out
 _FOREIGN = re.compile(r"!|\$P")
+_NAMED = re.compile(r"[$!]([A-Z][A-Z0-9]{2,9}),([^\r\n$!]*)")  # a sentence of any kind, with a checksum or without
+_SEALED = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")
 _UNREADABLE = (
     exceptions.NMEAParseError, exceptions.NMEAMessageError, exceptions.NMEATypeError, exceptions.NMEAStreamError,
     ValueError, TypeError, KeyError, IndexError, AttributeError,
@@ -53,6 +55,18 @@ def text_of(msg: Any) -> str:
 def identities(text: str) -> list[tuple[str, str]]:
     """Return talker and sentence ('GP', 'GGA') of each distinct sentence; some drivers put a whole burst into a message."""
     return list(dict.fromkeys((found[1], found[2]) for found in _SENTENCE.finditer(text)))
+
+
+def unread(text: str) -> list[str]:
+    """Return the names of the sentences of which no sensor reads anything ('GPGSV', 'PASHR', 'AIVDM'), and why of those it would read."""
+    names = []
+    for found in _NAMED.finditer(text):
+        name = found[1]
+        if name[2:] not in (*PLACES, *HEADINGS, *VELOCITIES, *SPEEDS):
+            names.append(name)
+        elif not _SEALED.search(found[2]):
+            names.append(f"{name} without a checksum")
+    return names
 
 
 def fix(text: str, wanted: Collection[str]) -> Fix | Rejection:

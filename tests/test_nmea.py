@@ -36,7 +36,7 @@ from graphloc.frontends.decode import DECODERS, TWIST
 from graphloc.frontends.inspect import _read, draft_config, inspect_bag, render
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix
-from tests.bagfactory import Item, Messages, S, write_bag
+from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_inspect import DATUM, drive, look
 
 SENTENCE = "nmea_msgs/msg/Sentence"
@@ -638,3 +638,27 @@ def test_an_axis_is_read_once(kind: str, one: list[str], other: list[str], what:
 def test_blocks_that_are_not_parsed_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="gnss: no SensorConfig"):
         VesselConfig.model_validate({"sensors": {"gnss": {"kind": "gnss", "topic": "/fix"}}})
+
+
+def test_inspect_names_the_sentences_that_are_not_read(tmp_path: Path) -> None:
+    """A driver that leaves checksums out, and makers' own headings, were passed over: `inspect` said that the type of the topic is not read."""
+    make = Messages(2)
+    make.register(OTHER_TYPES[SENTENCE], SENTENCE)
+    sentence = make.t[SENTENCE]
+    bodies = ["$GPGGA,120000.00,5742.0,N,01154.0,E,1,08,0.9,5.4,M,40.0,M,,", sealed("PASHR,120000.000,010.51,T,+00.39,-00.79,-00.84,0.1,0.1,0.5,1,0"),
+              sealed("GPGSV,1,1,00"), "!AIVDM,1,1,,A,13u?etPv2;0n:dDPwUM1U1Cb069D,0*24"]  # fmt: skip
+    items = [
+        ("/nmea", START_NS + k * S, sentence(make.header(START_NS + k * S), body)) for k in range(5) for body in bodies
+    ]
+    found, _, _ = look(tmp_path, items, make)
+    text = render(found)
+    for named in ("GPGGA without a checksum (5)", "PASHR (5)", "GPGSV (5)", "AIVDM (5)"):
+        assert named in text
+    assert "of no type that is read" not in text
+
+
+def test_sentences_that_are_read_are_not_named_as_unread() -> None:
+    burst = (
+        sealed("GPRMC,122310.2,A,3722.425671,N,12258.856215,W,10.0,270.0,230324,,,A") + "\r\n" + sealed("HEHDT,1.0,T")
+    )
+    assert nmea.unread(burst + "\r\n" + sealed("GPGSA,A,3")) == ["GPGSA"]
