@@ -131,11 +131,13 @@ def _nmea_velocity(text: str, wanted: str) -> Row | None:
     return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (*said, 0.0)
 
 
-def _nmea_speed(text: str, wanted: str) -> Row | None:
-    said = nmea.water_speed_mps(text, [wanted])
+def _nmea_speed(text: str, wanted: str, through: str = "ground") -> Row | None:
+    said = nmea.log_velocity_mps(text, [wanted], through)
     if isinstance(said, Rejection) and said.outcome is Outcome.MALFORMED:
         return None
-    return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (said, 0.0, 0.0)
+    return (
+        (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (said[0], said[1] if len(said) > 1 else 0.0, 0.0)
+    )
 
 
 # Of a sentence: the message type that says the same, and its row; None of a damaged one.
@@ -311,7 +313,7 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree, dict[str, Count
 
     An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type; 'TOPIC GPGGA+GNGGA' of a
     receiver that changes its talker. RMC gives another one of velocities, named 'TOPIC GPRMC (course, speed)', where it holds any and no
-    VTG is on the line; so does a GPSFix. A maker's message gives a stream of the equivalent type for each thing that it says. A Doppler log's
+    VTG is on the line; so does a GPSFix. VBW gives one over ground and one through water. A maker's message gives a stream of the equivalent type for each thing that it says. A Doppler log's
     velocities through water are one named 'TOPIC (through water)', what a filter made one named 'TOPIC (of a filter)'.
     """
     streams, tree = _empty_streams(bag), StaticTree()
@@ -380,12 +382,14 @@ def _add(stream: TopicData, row: Row | None, raw: RawMessage, msg: Any) -> None:
 
 
 def _of_no_use(streams: Mapping[str, TopicData]) -> list[str]:
-    """Return the names of streams that say nothing, or what others say as well."""
+    """Return the names of streams that say nothing, or what others say as well; of a log's two one stays."""
+    told = {name for name, stream in streams.items() if np.isfinite(stream.rows).any()}
     return [
         name
         for name, stream in streams.items()
         if (name.endswith((COURSE, HEADING)) and _told_elsewhere(stream, streams))
-        or (name + WATER in streams and not np.isfinite(stream.rows).any())
+        or (name + WATER in told and name not in told)
+        or (name.endswith(WATER) and name not in told)
     ]
 
 
@@ -486,4 +490,6 @@ def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tupl
             said.append((streams.setdefault(name, TopicData(name, msgtype)), row_of(text, talker + kind)))
         if kind == "RMC" and (row := _nmea_velocity(text, talker + kind)) is not None:
             said.append((streams.setdefault(name + COURSE, TopicData(name + COURSE, TWIST)), row))
+        if kind == "VBW" and (row := _nmea_speed(text, talker + kind, "water")) is not None:
+            said.append((streams.setdefault(name + WATER, TopicData(name + WATER, TWIST)), row))
     return said

@@ -456,10 +456,10 @@ def _body_velocity_number(msg: Any, stamp_ns: int, seq: int, sensor: str, config
 
 
 def _body_velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:
-    speed = nmea.water_speed_mps(nmea.text_of(msg), config.nmea)
-    if isinstance(speed, Rejection):
-        return speed
-    return _along((speed,), np.zeros((1, 1)), stamp_ns, seq, sensor, config)
+    v = nmea.log_velocity_mps(nmea.text_of(msg), config.nmea, config.through)
+    if isinstance(v, Rejection):
+        return v
+    return _along(v, np.zeros((len(v), len(v))), stamp_ns, seq, sensor, config)
 
 
 def _along(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sentences of NMEA 0183 (`nmea_msgs/Sentence`, `std_msgs/String`): position, heading, velocity, speed.
 
-Velocities are over ground, speeds through the water. pynmeagps parses the fields. Only requested sentences are parsed.
+Velocities are over ground; speeds are a log's, along the vessel, through the water or (VBW) over ground. pynmeagps parses the fields. Only requested sentences are parsed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from graphloc.frontends._rejections import Rejection, ignored, malformed, reject
 PLACES = ("GGA", "GNS", "RMC", "GLL")
 HEADINGS = ("HDT", "THS", "HDG", "HDM")
 VELOCITIES = ("VTG", "RMC")
-SPEEDS = ("VHW",)
+SPEEDS = ("VHW", "VBW")
 _SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # tag blocks before it are left out
 _FOREIGN = re.compile(r"!|\$P")
 _NAMED = re.compile(r"[$!]([A-Z][A-Z0-9]{2,9}),([^\r\n$!]*)")  # a sentence of any kind, with a checksum or without
@@ -125,13 +125,20 @@ def velocity_mps(text: str, wanted: Collection[str]) -> tuple[float, float] | Re
     return (speed * sin(east), speed * cos(east)) if isfinite(course) else (0.0, 0.0)
 
 
-def water_speed_mps(text: str, wanted: Collection[str]) -> float | Rejection:
-    """Return the speed through the water, ahead, m/s."""
-    said = _read(text, wanted, SPEEDS, "speed through the water")
+def log_velocity_mps(text: str, wanted: Collection[str], through: str) -> tuple[float, ...] | Rejection:
+    """Return the velocity by a log, ahead and, where it is told, to port, m/s; of VBW that over ground or that through the water."""
+    said = _read(text, wanted, SPEEDS, "speed by a log")
     if isinstance(said, Rejection):
         return said
-    speed = _speed_mps(said, "spdN", "spdK")
-    return speed if isfinite(speed) else rejected(f"{said.msgID}: no speed")
+    if said.msgID == "VHW":
+        speed = _speed_mps(said, "spdN", "spdK")
+        return (speed,) if isfinite(speed) else rejected(f"{said.msgID}: no speed")
+    if _field(said, f"{through}spdstatus") != "A":
+        return rejected(f"VBW: its speed {'over ground' if through == 'ground' else 'through the water'} is not valid")
+    ahead, starboard = (KNOT_MPS * _number(said, f"{axis}{through}spd") for axis in ("long", "trans"))
+    if not isfinite(ahead):
+        return rejected("VBW: no speed")
+    return (ahead, -starboard) if isfinite(starboard) else (ahead,)
 
 
 def _read(text: str, wanted: Collection[str], kinds: Collection[str], what: str) -> Any | Rejection:

@@ -35,7 +35,7 @@ from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import DECODERS, TWIST
 from graphloc.frontends.inspect import _read, draft_config, inspect_bag, render
 from graphloc.ledger import Outcome
-from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix
+from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, PoseFix
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_inspect import DATUM, drive, look
 
@@ -662,3 +662,52 @@ def test_sentences_that_are_read_are_not_named_as_unread() -> None:
         sealed("GPRMC,122310.2,A,3722.425671,N,12258.856215,W,10.0,270.0,230324,,,A") + "\r\n" + sealed("HEHDT,1.0,T")
     )
     assert nmea.unread(burst + "\r\n" + sealed("GPGSA,A,3")) == ["GPGSA"]
+
+
+@pytest.mark.parametrize(
+    ("body", "through", "mps"),
+    [("VDVBW,4.0,1.0,A,-2.0,-0.5,A,0.1,A,0.2,A", "water", (4.0, -1.0)),
+     ("VDVBW,4.0,1.0,A,-2.0,-0.5,A,0.1,A,0.2,A", "ground", (-2.0, 0.5)),
+     ("VDVBW,4.0,,A,,,V", "water", (4.0,)), ("VMVHW,,T,,M,4.0,N,7.4,K", "water", (4.0,))],
+)  # fmt: skip
+def test_a_log_tells_speeds_ahead_and_to_port(body: str, through: str, mps: tuple[float, ...]) -> None:
+    """VBW: to starboard positive, knots; an old one ends before the speeds of the stern."""
+    said = nmea.log_velocity_mps(sealed(body), nmea.SPEEDS, through)
+    assert said == pytest.approx(tuple(v * 1852.0 / 3600.0 for v in mps))
+
+
+def test_a_speed_that_a_log_calls_invalid_is_none() -> None:
+    said = nmea.log_velocity_mps(sealed("VDVBW,4.0,0.0,A,0.0,0.0,V"), nmea.SPEEDS, "ground")
+    assert isinstance(said, Rejection)
+    assert (said.outcome, said.reason) == (Outcome.REJECTED, "VBW: its speed over ground is not valid")
+
+
+@pytest.mark.parametrize("tracks_bottom", [True, False])
+def test_a_ships_log_is_drafted_over_ground_and_through_the_water(
+    tracks_bottom: bool, run: SimulatedRun, bag: Path, tmp_path: Path
+) -> None:
+    """VBW of a Doppler log; in deep water it loses the ground."""
+    make, items, truth = Messages(2), list[Item](), run.recording.truth
+    assert truth is not None
+    make.register(OTHER_TYPES[SENTENCE], SENTENCE)
+    for m in run.recording.of(GnssPosition):
+        lat, lon, height = m.position
+        place = f"{minutes(lat, 'NS', 2)},{minutes(lon, 'EW', 3)}"
+        at = truth.at(np.array([m.stamp_ns]))
+        ahead, port, _ = at.R_world_body[0].T @ at.v_world_mps[0] * 3600.0 / 1852.0  # type: ignore[index]
+        ground = f"{ahead:.2f},{-port:.2f},A" if tracks_bottom else ",,V"
+        for said in (
+            f"GPGGA,120000.00,{place},1,09,0.9,{height:.3f},M,0.0,M,,",
+            f"VDVBW,{ahead + 0.4:.2f},{-port:.2f},A,{ground},,V,,V",
+        ):
+            items.append(
+                ("/nmea", m.stamp_ns, make.t[SENTENCE](header=make.header(m.stamp_ns, "gps"), sentence=sealed(said)))
+            )
+    _, config, text = look(tmp_path, items, make)
+    logs = [s for s in config.sensors.values() if isinstance(s, BodyVelocityConfig)]
+    assert [s.through for s in logs] == (["ground", "water"] if tracks_bottom else ["water"])
+    assert all(s.nmea == ("VDVBW",) and s.axes == ("x", "y") for s in logs)
+    (tmp_path / "vessel.yaml").write_text(text.replace("enabled: false", "enabled: true"))
+    read = read_recording(tmp_path / "run", load_config(tmp_path / "vessel.yaml", KINDS)).of(BodyVelocity)
+    fixes = len(run.recording.of(GnssPosition))
+    assert len(read) == fixes * len(logs)
