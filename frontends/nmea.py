@@ -17,7 +17,7 @@ from pynmeagps import VALCKSUM, NMEAReader, exceptions
 from graphloc.frontends._rejections import Rejection, ignored, malformed, rejected
 
 PLACES = ("GGA", "GNS", "RMC", "GLL")
-HEADINGS = ("HDT", "THS", "HDG", "HDM")
+HEADINGS = ("HDT", "THS", "HDG", "HDM", "SHR")  # PASHR, which makers of INSs share
 VELOCITIES = ("VTG", "RMC")
 SPEEDS = ("VHW", "VBW")
 _SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # tag blocks before it are left out
@@ -31,6 +31,7 @@ _UNREADABLE = (
 KNOT_MPS, KM_PER_H_MPS = 1852.0 / 3600.0, 1.0 / 3.6
 SLOW_MPS = 0.1
 """Up to it a receiver may leave the course out: the velocity is then zero. Taken for a course of 0, its noise is a drift to the north."""
+_HEADING_FIELDS = {"HDT": "headingT", "THS": "headt", "HDM": "headingM", "HDG": "headingM", "ASHR": "trueHdg"}
 # Quality of a fix as GGA has it, from the mode letters of GNS, RMC and GLL.
 _QUALITIES = {"N": 0, "A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
 _NOT_MEASURED = {0: "no fix", 6: "dead reckoned by the receiver", 7: "typed in by hand", 8: "simulated by the receiver"}
@@ -58,7 +59,7 @@ def identities(text: str) -> list[tuple[str, str]]:
 
 
 def unread(text: str) -> list[str]:
-    """Return the names of the sentences of which no sensor reads anything ('GPGSV', 'PASHR', 'AIVDM'), and why of those it would read."""
+    """Return the names of the sentences of which no sensor reads anything ('GPGSV', 'PSAT', 'AIVDM'), and why of those it would read."""
     names = []
     for found in _NAMED.finditer(text):
         name = found[1]
@@ -102,7 +103,11 @@ def heading_deg(text: str, wanted: Collection[str]) -> float | Rejection:
         return said
     if said.msgID == "THS" and _field(said, "mi") != "A":
         return rejected("THS: its mode is not 'A': the heading is not measured")
-    value = _number(said, {"HDT": "headingT", "THS": "headt", "HDM": "headingM", "HDG": "headingM"}[said.msgID])
+    if said.msgID == "ASHR" and _field(said, "trueHdgInd") != "T" and _field(said, "msgId") != "ATT":
+        return ignored("PASHR: of a kind that tells no heading")
+    if said.msgID == "ASHR" and _field(said, "ambiguity"):
+        return rejected("PASHR: its ambiguities are not fixed")
+    value = _number(said, _HEADING_FIELDS[said.msgID])
     if said.msgID == "HDG":
         value += _east(said, "deviation") + _east(said, "variation")
     return value if isfinite(value) else rejected(f"{said.msgID}: no heading")

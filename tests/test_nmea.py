@@ -79,10 +79,12 @@ def test_other_sentences_say_places_too(body: str, quality: int) -> None:
 @pytest.mark.parametrize(
     ("body", "deg"),
     [("HEHDT,123.456,T", 123.456), ("GPTHS,77.52,A", 77.52), ("HCHDM,238.5,M", 238.5),
-     ("HCHDG,101.1,2.0,E,7.1,W", 96.0), ("HCHDG,101.1,,,,", 101.1)],
+     ("HCHDG,101.1,2.0,E,7.1,W", 96.0), ("HCHDG,101.1,,,,", 101.1),
+     ("PASHR,204132.000,010.51,T,+00.39,-00.79,-00.84,0.151,0.075,0.555,1,0", 10.51),
+     ("PASHR,ATT,220712.0,123.4,1.0,2.0,0.002,0.003,0", 123.4)],
 )  # fmt: skip
 def test_headings_are_clockwise_from_north(body: str, deg: float) -> None:
-    """HDG: what the needle says, deviation and variation east of it counted on."""
+    """HDG: what the needle says, deviation and variation east of it counted on. PASHR: of an INS, or by antennas."""
     assert nmea.heading_deg(sealed(body), nmea.HEADINGS) == pytest.approx(deg)
 
 
@@ -114,6 +116,9 @@ def test_velocities_are_east_and_north(body: str, east_mps: float, north_mps: fl
         (nmea.fix, sealed("GPRMC,122310.2,V,,,,,,,230324,,,N"), Outcome.REJECTED, "no fix"),
         (nmea.heading_deg, sealed("GPTHS,77.52,S"), Outcome.REJECTED, "not measured"),
         (nmea.heading_deg, sealed("HEHDT,,T"), Outcome.REJECTED, "no heading"),
+        (nmea.heading_deg, sealed("PASHR,204132.000,,T,,,,,,,0,0"), Outcome.REJECTED, "no heading"),
+        (nmea.heading_deg, sealed("PASHR,ATT,220712.0,123.4,1.0,2.0,0.002,0.003,1"), Outcome.REJECTED, "not fixed"),
+        (nmea.heading_deg, sealed("PASHR,SAT,3,2,1,1,1"), Outcome.IGNORED, "no heading"),
         (nmea.velocity_mps, sealed("GPVTG,,T,,M,010.0,N,018.5,K,A"), Outcome.REJECTED, "no course"),
         (nmea.velocity_mps, sealed("GPVTG,,,,,,,,,N"), Outcome.REJECTED, "no fix"),
     ],
@@ -645,14 +650,14 @@ def test_inspect_names_the_sentences_that_are_not_read(tmp_path: Path) -> None:
     make = Messages(2)
     make.register(OTHER_TYPES[SENTENCE], SENTENCE)
     sentence = make.t[SENTENCE]
-    bodies = ["$GPGGA,120000.00,5742.0,N,01154.0,E,1,08,0.9,5.4,M,40.0,M,,", sealed("PASHR,120000.000,010.51,T,+00.39,-00.79,-00.84,0.1,0.1,0.5,1,0"),
+    bodies = ["$GPGGA,120000.00,5742.0,N,01154.0,E,1,08,0.9,5.4,M,40.0,M,,", sealed("PSAT,HPR,120000.00,10.51,0.4,-0.8,N"),
               sealed("GPGSV,1,1,00"), "!AIVDM,1,1,,A,13u?etPv2;0n:dDPwUM1U1Cb069D,0*24"]  # fmt: skip
     items = [
         ("/nmea", START_NS + k * S, sentence(make.header(START_NS + k * S), body)) for k in range(5) for body in bodies
     ]
     found, _, _ = look(tmp_path, items, make)
     text = render(found)
-    for named in ("GPGGA without a checksum (5)", "PASHR (5)", "GPGSV (5)", "AIVDM (5)"):
+    for named in ("GPGGA without a checksum (5)", "PSAT (5)", "GPGSV (5)", "AIVDM (5)"):
         assert named in text
     assert "of no type that is read" not in text
 

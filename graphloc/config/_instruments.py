@@ -95,7 +95,7 @@ class ImuConfig(SensorConfig):
 
 _TALKER = "^([A-Z]{2})?"
 Places = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(GGA|GNS|RMC|GLL)$")], ...], Field(min_length=1)]
-Headings = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(HDT|THS|HDG|HDM)$")], ...], Field(min_length=1)]
+Headings = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(HDT|THS|HDG|HDM|SHR)$")], ...], Field(min_length=1)]
 Velocities = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(VTG|RMC)$")], ...], Field(min_length=1)]
 Speeds = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(VHW|VBW)$")], ...], Field(min_length=1)]
 SpeedAxes = Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)]
@@ -186,7 +186,7 @@ class CompassConfig(SensorConfig):
     wander_time_constant_s: Positive = 60.0
     """Correlation time of that error, s."""
     nmea: Headings = ("HDT", "THS")
-    """NMEA sentences to read, from one talker (`HEHDT`) or any (`HDT`): HDT, THS, HDG, HDM."""
+    """NMEA sentences to read, from one talker (`HEHDT`) or any (`HDT`): HDT, THS, HDG, HDM, PASHR."""
 
     @property
     def apart_ns(self) -> int:
