@@ -149,6 +149,7 @@ SENTENCES: dict[str, tuple[str, Callable[[str, str], Row | None]]] = {
 }
 _SATELLITES = re.compile("(G[A-Z]|BD)[A-Z]{3}")  # a talker that names what a receiver sees
 _BESIDE, _BY_CHANCE = 0.75, 0.2  # steps: a sentence said at the same time; the share of those that one receiver may say
+_AS_OFTEN = 0.8  # of the sentences with a velocity, from which VTG says what RMC says; some receivers leave it empty, or say it every other time
 COURSE, HEADING = " (course, speed)", " (heading)"
 """At the end of the name of a stream: what RMC, a GPSFix, or a maker's message, says beside a place."""
 # Of what makers' messages say: the message type that says the same, and a row without a value.
@@ -442,10 +443,15 @@ def _take_turns(logs_ns: Sequence[NDArray[np.int64]]) -> bool:
 
 
 def _told_elsewhere(stream: TopicData, streams: Mapping[str, TopicData]) -> bool:
-    """Whether what is said beside a place is nothing, or what VTG on the same line says as well."""
-    line = stream.topic.partition(" ")[0]
-    vtg = any(name.startswith(f"{line} ") and name.endswith("VTG") for name in streams)
+    """Whether what is said beside a place is nothing, or what VTG on the same line says as well, and about as often."""
+    line, least = stream.topic.partition(" ")[0], _AS_OFTEN * _told(stream)
+    vtg = any(name.startswith(f"{line} ") and name.endswith("VTG") and _told(s) >= least for name, s in streams.items())
     return vtg or not np.nan_to_num(stream.rows).any()
+
+
+def _told(stream: TopicData) -> int:
+    """Return how many messages of a stream tell something."""
+    return int(np.isfinite(stream.rows).all(axis=-1).sum()) if len(stream) else 0
 
 
 def _plain(raw: RawMessage, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:

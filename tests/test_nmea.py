@@ -286,8 +286,9 @@ def rmc_bag(path: Path, more: Callable[[float, float], list[str]], speeds: bool 
         (lambda *_: [], False, None),
         (lambda kn, deg: [f"GPVTG,{deg:.1f},T,,M,{kn:.3f},N,{kn * 1.852:.3f},K,A"], True, ("GPVTG",)),
         (lambda kn, deg: [f"GNVTG,{deg:.1f},T,,M,{kn:.3f},N,{kn * 1.852:.3f},K,A"], True, ("GNVTG",)),
+        (lambda *_: ["GPVTG,,T,,M,,N,,K"], True, ("GPRMC",)),
     ],
-    ids=["RMC", "without a speed", "VTG", "VTG of another talker"],
+    ids=["RMC", "without a speed", "VTG", "VTG of another talker", "empty VTG"],
 )
 def test_course_and_speed_of_rmc_are_drafted_where_no_vtg_says_them(
     more: Callable[[float, float], list[str]], speeds: bool, read: tuple[str, ...] | None, tmp_path: Path
