@@ -20,6 +20,7 @@ from graphloc.frontends._reports import (
     OdometryReport,
     VelocityReport,
     filtered,
+    of_log,
     through_water,
 )
 from graphloc.frontends._streams import TopicData
@@ -139,8 +140,11 @@ def velocity_report(
         why = f"by the names of its topic and frame; {why}"
     if axes is None and _OF_LOG.search(f"{stream.topic} {stream.frame_id}"):
         axes, why = BODY_AXES, f"by the names of its topic and frame; {why}"
-    if through_water(stream.topic):
-        axes, why = BODY_AXES, f"a speed through the water; {why}"
+    if of_log(stream.topic) or through_water(stream.topic):
+        axes, why = (
+            BODY_AXES,
+            f"a speed {'through the water' if through_water(stream.topic) else 'over ground by a log'}; {why}",
+        )
     rows = stream.rows[sane(stream)]
     reverse = axes == BODY_AXES and pose is None and len(rows) > 0 and _astern(rows[:, -3])
     return VelocityReport(
@@ -151,6 +155,7 @@ def velocity_report(
         tf_frame=None if pose is None else stream.frame_id,
         reverse=reverse,
         mount=_mount_of_log(stream.frame_id, pose, reverse) if log else None,
+        sideways=of_log(stream.topic) and bool(np.nan_to_num(rows[:, -2]).any()),
     )
 
 

@@ -461,6 +461,7 @@ def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:
     return [
         *lines,
         f"  enabled: false  # guess: {fuse}; its axes look {twist.axes}; {twist.why}",
+        *(["  axes: [x, y]"] if twist.sideways else []),
         f"  mount: {{{frame}}}  # {known}",
     ]  # fmt: skip
 

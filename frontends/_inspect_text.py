@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import islice
 
 from graphloc.frontends._draft_clock import clock_lines
 from graphloc.frontends._reports import GnssReport, ImuReport, Inspection, OdometryReport, TopicReport
 from graphloc.plain import aligned
 from graphloc.time import utc_text
 
+_MOST_NAMED = 12  # sentences that are not read
 # How the draft names an odometry or pose topic, by its role.
 _DRAFTED = {"truth": "truth_topic", "check_speed": "check_speed_topic", "pose": "a sensor of kind pose, switched off"}
 
@@ -89,6 +91,11 @@ def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
         if t.recorded:
             lines.append(
                 f"{t.topic}: its headers hold no stamps (all zero, all the same, or whole seconds): recording times are used"
+            )
+        if t.unread:
+            named = [f"{name} ({n})" for name, n in islice(t.unread.items(), _MOST_NAMED)]
+            lines.append(
+                f"{t.topic}: of its sentences not read: {', '.join(named)}{', ...' if len(t.unread) > _MOST_NAMED else ''}"
             )
         if t.undecodable or t.no_stamp:
             lines.append(f"{t.topic}: {t.undecodable} messages cannot be decoded, {t.no_stamp or 0} have no stamp")

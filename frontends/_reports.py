@@ -37,7 +37,12 @@ def two_antennas(topic: str) -> bool:
 
 def through_water(topic: str) -> bool:
     """Return whether a velocity is through the water, by the name of its stream: its sentence of NMEA, or what its messages say."""
-    return topic.endswith((*SPEEDS, WATER))
+    return topic.endswith(("VHW", WATER))
+
+
+def of_log(topic: str) -> bool:
+    """Return whether a velocity is a log's, along the vessel, by its sentence of NMEA."""
+    return topic.removesuffix(WATER).endswith(SPEEDS)
 
 
 def filtered(topic: str) -> bool:
@@ -55,6 +60,7 @@ class TopicReport:
         recorded: whether the headers hold no stamps, or whole seconds only, so that the recording times stand for them here.
         latency_s: recording time minus header stamp: 5 %, 50 %, 95 % points; without what the clock gains.
         drift_ppm: by how much the clock runs fast, where that is clear; else 0.
+        unread: of NMEA, the sentences that no sensor reads, by name, the most frequent one first, and how many there are of each.
     """
 
     topic: str
@@ -73,6 +79,7 @@ class TopicReport:
     recorded: bool = False
     latency_s: Vec | None = None
     drift_ppm: float = 0.0
+    unread: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -255,6 +262,7 @@ class VelocityReport:
     """A velocity topic: the axes that fit the GNSS track ('unknown': none does; None: nothing to judge by), and why; `late_s` as of a receiver.
 
     `reverse`: it says astern throughout, which is taken for a wrong sign. `mount`: of one whose own axes are known by its type.
+    `sideways`: a log's that tells its speed to the side, too.
     """
 
     topic: str
@@ -265,6 +273,7 @@ class VelocityReport:
     late_s: tuple[float, float] | None = None
     reverse: bool = False
     mount: MountGuess | None = None
+    sideways: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

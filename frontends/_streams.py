@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
@@ -130,11 +131,13 @@ def _nmea_velocity(text: str, wanted: str) -> Row | None:
     return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (*said, 0.0)
 
 
-def _nmea_speed(text: str, wanted: str) -> Row | None:
-    said = nmea.water_speed_mps(text, [wanted])
+def _nmea_speed(text: str, wanted: str, through: str = "ground") -> Row | None:
+    said = nmea.log_velocity_mps(text, [wanted], through)
     if isinstance(said, Rejection) and said.outcome is Outcome.MALFORMED:
         return None
-    return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (said, 0.0, 0.0)
+    return (
+        (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (said[0], said[1] if len(said) > 1 else 0.0, 0.0)
+    )
 
 
 # Of a sentence: the message type that says the same, and its row; None of a damaged one.
@@ -146,6 +149,7 @@ SENTENCES: dict[str, tuple[str, Callable[[str, str], Row | None]]] = {
 }
 _SATELLITES = re.compile("(G[A-Z]|BD)[A-Z]{3}")  # a talker that names what a receiver sees
 _BESIDE, _BY_CHANCE = 0.75, 0.2  # steps: a sentence said at the same time; the share of those that one receiver may say
+_AS_OFTEN = 0.8  # of the sentences with a velocity, from which VTG says what RMC says; some receivers leave it empty, or say it every other time
 COURSE, HEADING = " (course, speed)", " (heading)"
 """At the end of the name of a stream: what RMC, a GPSFix, or a maker's message, says beside a place."""
 # Of what makers' messages say: the message type that says the same, and a row without a value.
@@ -305,23 +309,23 @@ class TopicData:
         return len(self._stamps)
 
 
-def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree]:
-    """Read all topics of the types in `ROWS` and `VENDORS`, and the static transforms.
+def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree, dict[str, Counter[str]]]:
+    """Read all topics of the types in `ROWS` and `VENDORS`, the static transforms, and by topic how many sentences of NMEA nothing reads.
 
     An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type; 'TOPIC GPGGA+GNGGA' of a
     receiver that changes its talker. RMC gives another one of velocities, named 'TOPIC GPRMC (course, speed)', where it holds any and no
-    VTG is on the line; so does a GPSFix. A maker's message gives a stream of the equivalent type for each thing that it says. A Doppler log's
+    VTG is on the line; so does a GPSFix. VBW gives one over ground and one through water. A maker's message gives a stream of the equivalent type for each thing that it says. A Doppler log's
     velocities through water are one named 'TOPIC (through water)', what a filter made one named 'TOPIC (of a filter)'.
     """
     streams, tree = _empty_streams(bag), StaticTree()
-    _fill(streams, tree, bag)
+    unread = _fill(streams, tree, bag)
     tree.settle()
     _join_talkers(streams)
     for name in _of_no_use(streams):
         del streams[name]
     for stream in streams.values():
         stream.settle()
-    return [_named_as_filters(stream) for stream in streams.values()], tree
+    return [_named_as_filters(stream) for stream in streams.values()], tree, unread
 
 
 def _empty_streams(bag: Bag) -> dict[str, TopicData]:
@@ -342,8 +346,9 @@ def _empty_streams(bag: Bag) -> dict[str, TopicData]:
     return streams
 
 
-def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> None:
-    """Read the messages of a bag into streams and transforms, in place."""
+def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> dict[str, Counter[str]]:
+    """Read the messages of a bag into streams and transforms, in place; return how many sentences of a topic are not read."""
+    unread: dict[str, Counter[str]] = {}
     mixed = {t.topic for t in bag.topics.values() if len(t.msgtypes) == 1 and t.msgtypes[0] in NMEA}
     wanted = set(streams) | mixed | ({TF_STATIC, TF_MOVING} & set(bag.topics))
     for raw in bag.messages(wanted) if wanted else ():
@@ -354,12 +359,15 @@ def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> None:
         try:
             msg = bag.decode(raw)
             said = _sentences(raw.topic, msg, streams) if raw.topic in mixed else _plain(raw, msg, streams)
+            if raw.topic in mixed:
+                unread.setdefault(raw.topic, Counter()).update(nmea.unread(nmea.text_of(msg)))
         except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything; counted
             said = [(streams[raw.topic], None)] if raw.topic in streams else []
         if raw.topic == TF_STATIC:
             tree.take(raw.msgtype, msg)
         for stream, row in said:
             _add(stream, row, raw, msg)
+    return unread
 
 
 def _add(stream: TopicData, row: Row | None, raw: RawMessage, msg: Any) -> None:
@@ -375,12 +383,14 @@ def _add(stream: TopicData, row: Row | None, raw: RawMessage, msg: Any) -> None:
 
 
 def _of_no_use(streams: Mapping[str, TopicData]) -> list[str]:
-    """Return the names of streams that say nothing, or what others say as well."""
+    """Return the names of streams that say nothing, or what others say as well; of a log's two one stays."""
+    told = {name for name, stream in streams.items() if np.isfinite(stream.rows).any()}
     return [
         name
         for name, stream in streams.items()
         if (name.endswith((COURSE, HEADING)) and _told_elsewhere(stream, streams))
-        or (name + WATER in streams and not np.isfinite(stream.rows).any())
+        or (name + WATER in told and name not in told)
+        or (name.endswith(WATER) and name not in told)
     ]
 
 
@@ -433,10 +443,15 @@ def _take_turns(logs_ns: Sequence[NDArray[np.int64]]) -> bool:
 
 
 def _told_elsewhere(stream: TopicData, streams: Mapping[str, TopicData]) -> bool:
-    """Whether what is said beside a place is nothing, or what VTG on the same line says as well."""
-    line = stream.topic.partition(" ")[0]
-    vtg = any(name.startswith(f"{line} ") and name.endswith("VTG") for name in streams)
+    """Whether what is said beside a place is nothing, or what VTG on the same line says as well, and about as often."""
+    line, least = stream.topic.partition(" ")[0], _AS_OFTEN * _told(stream)
+    vtg = any(name.startswith(f"{line} ") and name.endswith("VTG") and _told(s) >= least for name, s in streams.items())
     return vtg or not np.nan_to_num(stream.rows).any()
+
+
+def _told(stream: TopicData) -> int:
+    """Return how many messages of a stream tell something."""
+    return int(np.isfinite(stream.rows).all(axis=-1).sum()) if len(stream) else 0
 
 
 def _plain(raw: RawMessage, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:
@@ -481,4 +496,6 @@ def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tupl
             said.append((streams.setdefault(name, TopicData(name, msgtype)), row_of(text, talker + kind)))
         if kind == "RMC" and (row := _nmea_velocity(text, talker + kind)) is not None:
             said.append((streams.setdefault(name + COURSE, TopicData(name + COURSE, TWIST)), row))
+        if kind == "VBW" and (row := _nmea_speed(text, talker + kind, "water")) is not None:
+            said.append((streams.setdefault(name + WATER, TopicData(name + WATER, TWIST)), row))
     return said

@@ -28,7 +28,7 @@ def unused_topics(streams: Sequence[TopicData], used: Container[str]) -> list[st
     lines = (
         []
         if any(len(s) or s.undecodable or s.no_stamp for s in streams)
-        else ["the bag holds no message of a known type"]
+        else ["the bag holds no message of a known type, or no sentence of NMEA that is read"]
     )
     for stream in streams:
         if stream.topic in used or stream.msgtype not in (IMU, *_FIXES):

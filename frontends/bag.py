@@ -51,6 +51,7 @@ from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import Yaws, pose_turn_warning, refuse_unit, turn_warnings, wander_warning
 from graphloc.frontends.decode import (
+    NMEA,
     ODOMETRY,
     PLAIN_POSE,
     POSE,
@@ -234,12 +235,24 @@ def _subscriptions(config: VesselConfig, topics: Mapping[str, TopicSummary], bag
     return found
 
 
+def _tells_both(own: Sequence[str], other: Sequence[str]) -> bool:
+    """Whether no sentence that both lists name tells one velocity alone; VBW tells that over ground and that through the water."""
+    kinds = {said[-3:] for said in own} & {said[-3:] for said in other}
+    return kinds <= {"VBW"}
+
+
 def _check_through(name: str, sensor: SensorConfig, others: Sequence[Readings], topic: TopicSummary, bag: str) -> None:
     """Raise an `InputError` if another sensor reads the same velocities as those through something else, and nothing tells which they are."""
     if not isinstance(sensor, BodyVelocityConfig):
         return
     own = [r for r in others if r.config.topic == sensor.topic]
-    twins = [r.sensor for r in own if isinstance(r.config, BodyVelocityConfig) and r.config.through != sensor.through]
+    twins = [
+        r.sensor
+        for r in own
+        if isinstance(r.config, BodyVelocityConfig)
+        and r.config.through != sensor.through
+        and not (set(topic.msgtypes) <= set(NMEA) and _tells_both(sensor.nmea, r.config.nmea))
+    ]
     telling = any(part.through for msgtype in topic.msgtypes for part in VENDORS.get(msgtype, ()))
     if twins and not telling:
         raise InputError(

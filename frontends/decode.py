@@ -406,7 +406,9 @@ def gps_fix_velocity_mps(msg: Any) -> tuple[float, float, float] | Rejection:
     speed, track, climb = float(msg.speed), float(msg.track), float(msg.climb)
     if not isfinite(speed) or (speed > nmea.SLOW_MPS and not isfinite(track)):
         return rejected(f"no {'track' if isfinite(speed) else 'speed'}")
-    angle = np.radians(track if isfinite(track) else 0.0)
+    if not isfinite(track):
+        return 0.0, 0.0, climb or np.nan
+    angle = np.radians(track)
     return float(speed * np.sin(angle)), float(speed * np.cos(angle)), climb or np.nan
 
 
@@ -454,10 +456,10 @@ def _body_velocity_number(msg: Any, stamp_ns: int, seq: int, sensor: str, config
 
 
 def _body_velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:
-    speed = nmea.water_speed_mps(nmea.text_of(msg), config.nmea)
-    if isinstance(speed, Rejection):
-        return speed
-    return _along((speed,), np.zeros((1, 1)), stamp_ns, seq, sensor, config)
+    v = nmea.log_velocity_mps(nmea.text_of(msg), config.nmea, config.through)
+    if isinstance(v, Rejection):
+        return v
+    return _along(v, np.zeros((len(v), len(v))), stamp_ns, seq, sensor, config)
 
 
 def _along(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -76,6 +77,7 @@ from graphloc.frontends.decode import (
     GPS_FIXES,
     IMU,
     NAV_SAT_FIX,
+    NMEA,
     NUMBERS,
     ODOMETRY,
     PLAIN_POSE,
@@ -141,7 +143,7 @@ class _Contents:
     Attributes:
         source: its name, for messages. topics: by name, from its index.
         streams: by topic, as recorded. aligned: those with messages, on one clock.
-        tree: of tf. lidars, cameras, infos (their CameraInfos): by topic.
+        tree: of tf. unread: how many sentences of NMEA no sensor reads, by topic and name. lidars, cameras, infos (their CameraInfos): by topic.
     """
 
     source: str
@@ -149,6 +151,7 @@ class _Contents:
     streams: Mapping[str, TopicData]
     aligned: Mapping[str, TopicData]
     tree: StaticTree
+    unread: Mapping[str, Counter[str]]
     lidars: Mapping[str, _First]
     cameras: Mapping[str, _First]
     infos: Mapping[str, _First]
@@ -251,7 +254,7 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
     with Bag(paths) as bag:
         topics = bag.topics
         bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
-        streams, tree = read_streams(bag)
+        streams, tree, unread = read_streams(bag)
         lidars = _firsts_of(bag, [t.topic for t in topics.values() if set(CLOUDS) & set(t.msgtypes) and t.messages])
         cameras = _firsts_of(bag, _pictures(bag))
         infos = _firsts_of(
@@ -271,7 +274,7 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
     return _Contents(
         source=source, topics=topics, streams={s.topic: s for s in streams},
         aligned={s.topic: s for s in on_one_clock([_as_mostly_set(s, steps) for s in streams if len(s)])},
-        tree=tree, lidars=lidars, cameras=cameras, infos=infos, warnings=warnings,
+        tree=tree, unread=unread, lidars=lidars, cameras=cameras, infos=infos, warnings=warnings,
     )  # fmt: skip
 
 
@@ -281,7 +284,12 @@ def _topic_reports(bag: _Contents) -> tuple[TopicReport, ...]:
     topics = [
         replace(topic_report(streams[t.topic], t.messages), topic=t.topic, msgtype=t.msgtypes[0])
         if t.topic in streams
-        else TopicReport(topic=t.topic, msgtype=" or ".join(t.msgtypes), count=t.messages)
+        else TopicReport(
+            topic=t.topic,
+            msgtype=" or ".join(t.msgtypes),
+            count=t.messages,
+            unread=dict(bag.unread.get(t.topic, Counter()).most_common()),
+        )
         for t in bag.topics.values()
     ]
     return (*topics, *(topic_report(s, len(s)) for name, s in streams.items() if name not in bag.topics))
@@ -426,7 +434,11 @@ def _lacking(
     if not (gnss or bag.lidars or bag.cameras or any(report.role == "pose" or report.grid for report in odometry)):
         lines.append("nothing in it tells the place: no GNSS fix that can be used, no pose")
     read = {name.partition(" ")[0] for name in bag.streams}  # of NMEA a stream is a sentence
-    others = [t for t in bag.topics.values() if t.topic not in read and not _KNOWN.match(t.msgtypes[0])]
+    others = [
+        t
+        for t in bag.topics.values()
+        if t.topic not in read and t.msgtypes[0] not in NMEA and not _KNOWN.match(t.msgtypes[0])
+    ]
     if lines and others:
         named = ", ".join(f"{t.topic} ({' or '.join(t.msgtypes).replace('/msg/', '/')})" for t in others[:_MOST_NAMED])
         lines.append(f"of no type that is read here: {named}{', ...' if len(others) > _MOST_NAMED else ''}")

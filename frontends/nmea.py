@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sentences of NMEA 0183 (`nmea_msgs/Sentence`, `std_msgs/String`): position, heading, velocity, speed.
 
-Velocities are over ground, speeds through the water. pynmeagps parses the fields. Only requested sentences are parsed.
+Velocities are over ground; speeds are a log's, along the vessel, through the water or (VBW) over ground. pynmeagps parses the fields. Only requested sentences are parsed.
 """
 
 from __future__ import annotations
@@ -17,18 +17,21 @@ from pynmeagps import VALCKSUM, NMEAReader, exceptions
 from graphloc.frontends._rejections import Rejection, ignored, malformed, rejected
 
 PLACES = ("GGA", "GNS", "RMC", "GLL")
-HEADINGS = ("HDT", "THS", "HDG", "HDM")
+HEADINGS = ("HDT", "THS", "HDG", "HDM", "SHR")  # PASHR, which makers of INSs share
 VELOCITIES = ("VTG", "RMC")
-SPEEDS = ("VHW",)
+SPEEDS = ("VHW", "VBW")
 _SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # tag blocks before it are left out
 _FOREIGN = re.compile(r"!|\$P")
+_NAMED = re.compile(r"[$!]([A-Z][A-Z0-9]{2,9}),([^\r\n$!]*)")  # a sentence of any kind, with a checksum or without
+_SEALED = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")
 _UNREADABLE = (
     exceptions.NMEAParseError, exceptions.NMEAMessageError, exceptions.NMEATypeError, exceptions.NMEAStreamError,
     ValueError, TypeError, KeyError, IndexError, AttributeError,
 )  # fmt: skip
 KNOT_MPS, KM_PER_H_MPS = 1852.0 / 3600.0, 1.0 / 3.6
 SLOW_MPS = 0.1
-"""Below it a receiver may leave the course out."""
+"""Up to it a receiver may leave the course out: the velocity is then zero. Taken for a course of 0, its noise is a drift to the north."""
+_HEADING_FIELDS = {"HDT": "headingT", "THS": "headt", "HDM": "headingM", "HDG": "headingM", "ASHR": "trueHdg"}
 # Quality of a fix as GGA has it, from the mode letters of GNS, RMC and GLL.
 _QUALITIES = {"N": 0, "A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
 _NOT_MEASURED = {0: "no fix", 6: "dead reckoned by the receiver", 7: "typed in by hand", 8: "simulated by the receiver"}
@@ -53,6 +56,18 @@ def text_of(msg: Any) -> str:
 def identities(text: str) -> list[tuple[str, str]]:
     """Return talker and sentence ('GP', 'GGA') of each distinct sentence; some drivers put a whole burst into a message."""
     return list(dict.fromkeys((found[1], found[2]) for found in _SENTENCE.finditer(text)))
+
+
+def unread(text: str) -> list[str]:
+    """Return the names of the sentences of which no sensor reads anything ('GPGSV', 'PSAT', 'AIVDM'), and why of those it would read."""
+    names = []
+    for found in _NAMED.finditer(text):
+        name = found[1]
+        if name[2:] not in (*PLACES, *HEADINGS, *VELOCITIES, *SPEEDS):
+            names.append(name)
+        elif not _SEALED.search(found[2]):
+            names.append(f"{name} without a checksum")
+    return names
 
 
 def fix(text: str, wanted: Collection[str]) -> Fix | Rejection:
@@ -88,7 +103,11 @@ def heading_deg(text: str, wanted: Collection[str]) -> float | Rejection:
         return said
     if said.msgID == "THS" and _field(said, "mi") != "A":
         return rejected("THS: its mode is not 'A': the heading is not measured")
-    value = _number(said, {"HDT": "headingT", "THS": "headt", "HDM": "headingM", "HDG": "headingM"}[said.msgID])
+    if said.msgID == "ASHR" and _field(said, "trueHdgInd") != "T" and _field(said, "msgId") != "ATT":
+        return ignored("PASHR: of a kind that tells no heading")
+    if said.msgID == "ASHR" and _field(said, "ambiguity"):
+        return rejected("PASHR: its ambiguities are not fixed")
+    value = _number(said, _HEADING_FIELDS[said.msgID])
     if said.msgID == "HDG":
         value += _east(said, "deviation") + _east(said, "variation")
     return value if isfinite(value) else rejected(f"{said.msgID}: no heading")
@@ -107,17 +126,24 @@ def velocity_mps(text: str, wanted: Collection[str]) -> tuple[float, float] | Re
         speed, course = _speed_mps(said, "sogn", "sogk"), _number(said, "cogt")
     if not isfinite(speed) or (speed > SLOW_MPS and not isfinite(course)):
         return rejected(f"{said.msgID}: no {'course' if isfinite(speed) else 'speed'}")
-    east = radians(course if isfinite(course) else 0.0)
-    return speed * sin(east), speed * cos(east)
+    east = radians(course)
+    return (speed * sin(east), speed * cos(east)) if isfinite(course) else (0.0, 0.0)
 
 
-def water_speed_mps(text: str, wanted: Collection[str]) -> float | Rejection:
-    """Return the speed through the water, ahead, m/s."""
-    said = _read(text, wanted, SPEEDS, "speed through the water")
+def log_velocity_mps(text: str, wanted: Collection[str], through: str) -> tuple[float, ...] | Rejection:
+    """Return the velocity by a log, ahead and, where it is told, to port, m/s; of VBW that over ground or that through the water."""
+    said = _read(text, wanted, SPEEDS, "speed by a log")
     if isinstance(said, Rejection):
         return said
-    speed = _speed_mps(said, "spdN", "spdK")
-    return speed if isfinite(speed) else rejected(f"{said.msgID}: no speed")
+    if said.msgID == "VHW":
+        speed = _speed_mps(said, "spdN", "spdK")
+        return (speed,) if isfinite(speed) else rejected(f"{said.msgID}: no speed")
+    if _field(said, f"{through}spdstatus") != "A":
+        return rejected(f"VBW: its speed {'over ground' if through == 'ground' else 'through the water'} is not valid")
+    ahead, starboard = (KNOT_MPS * _number(said, f"{axis}{through}spd") for axis in ("long", "trans"))
+    if not isfinite(ahead):
+        return rejected("VBW: no speed")
+    return (ahead, -starboard) if isfinite(starboard) else (ahead,)
 
 
 def _read(text: str, wanted: Collection[str], kinds: Collection[str], what: str) -> Any | Rejection:

@@ -35,8 +35,8 @@ from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import DECODERS, TWIST
 from graphloc.frontends.inspect import _read, draft_config, inspect_bag, render
 from graphloc.ledger import Outcome
-from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix
-from tests.bagfactory import Item, Messages, S, write_bag
+from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, PoseFix
+from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.test_inspect import DATUM, drive, look
 
 SENTENCE = "nmea_msgs/msg/Sentence"
@@ -79,10 +79,12 @@ def test_other_sentences_say_places_too(body: str, quality: int) -> None:
 @pytest.mark.parametrize(
     ("body", "deg"),
     [("HEHDT,123.456,T", 123.456), ("GPTHS,77.52,A", 77.52), ("HCHDM,238.5,M", 238.5),
-     ("HCHDG,101.1,2.0,E,7.1,W", 96.0), ("HCHDG,101.1,,,,", 101.1)],
+     ("HCHDG,101.1,2.0,E,7.1,W", 96.0), ("HCHDG,101.1,,,,", 101.1),
+     ("PASHR,204132.000,010.51,T,+00.39,-00.79,-00.84,0.151,0.075,0.555,1,0", 10.51),
+     ("PASHR,ATT,220712.0,123.4,1.0,2.0,0.002,0.003,0", 123.4)],
 )  # fmt: skip
 def test_headings_are_clockwise_from_north(body: str, deg: float) -> None:
-    """HDG: what the needle says, deviation and variation east of it counted on."""
+    """HDG: what the needle says, deviation and variation east of it counted on. PASHR: of an INS, or by antennas."""
     assert nmea.heading_deg(sealed(body), nmea.HEADINGS) == pytest.approx(deg)
 
 
@@ -90,7 +92,7 @@ def test_headings_are_clockwise_from_north(body: str, deg: float) -> None:
     ("body", "east_mps", "north_mps"),
     [("GPVTG,090.0,T,,M,010.0,N,018.5,K,A", 10.0 * 1852.0 / 3600.0, 0.0),
      ("GPVTG,180.0,T,,M,,N,036.0,K", 0.0, -10.0),
-     ("GPVTG,,T,,M,0.01,N,0.02,K,D", 0.0, 0.01 * 1852.0 / 3600.0),  # at rest there is no course
+     ("GPVTG,,T,,M,0.18,N,0.33,K,D", 0.0, 0.0),  # at rest there is no course: noise, which is not to the north
      ("GPRMC,122310.2,A,3722.425671,N,12258.856215,W,10.0,270.0,230324,,,A", -10.0 * 1852.0 / 3600.0, 0.0)],
 )  # fmt: skip
 def test_velocities_are_east_and_north(body: str, east_mps: float, north_mps: float) -> None:
@@ -114,6 +116,9 @@ def test_velocities_are_east_and_north(body: str, east_mps: float, north_mps: fl
         (nmea.fix, sealed("GPRMC,122310.2,V,,,,,,,230324,,,N"), Outcome.REJECTED, "no fix"),
         (nmea.heading_deg, sealed("GPTHS,77.52,S"), Outcome.REJECTED, "not measured"),
         (nmea.heading_deg, sealed("HEHDT,,T"), Outcome.REJECTED, "no heading"),
+        (nmea.heading_deg, sealed("PASHR,204132.000,,T,,,,,,,0,0"), Outcome.REJECTED, "no heading"),
+        (nmea.heading_deg, sealed("PASHR,ATT,220712.0,123.4,1.0,2.0,0.002,0.003,1"), Outcome.REJECTED, "not fixed"),
+        (nmea.heading_deg, sealed("PASHR,SAT,3,2,1,1,1"), Outcome.IGNORED, "no heading"),
         (nmea.velocity_mps, sealed("GPVTG,,T,,M,010.0,N,018.5,K,A"), Outcome.REJECTED, "no course"),
         (nmea.velocity_mps, sealed("GPVTG,,,,,,,,,N"), Outcome.REJECTED, "no fix"),
     ],
@@ -281,8 +286,9 @@ def rmc_bag(path: Path, more: Callable[[float, float], list[str]], speeds: bool 
         (lambda *_: [], False, None),
         (lambda kn, deg: [f"GPVTG,{deg:.1f},T,,M,{kn:.3f},N,{kn * 1.852:.3f},K,A"], True, ("GPVTG",)),
         (lambda kn, deg: [f"GNVTG,{deg:.1f},T,,M,{kn:.3f},N,{kn * 1.852:.3f},K,A"], True, ("GNVTG",)),
+        (lambda *_: ["GPVTG,,T,,M,,N,,K"], True, ("GPRMC",)),
     ],
-    ids=["RMC", "without a speed", "VTG", "VTG of another talker"],
+    ids=["RMC", "without a speed", "VTG", "VTG of another talker", "empty VTG"],
 )
 def test_course_and_speed_of_rmc_are_drafted_where_no_vtg_says_them(
     more: Callable[[float, float], list[str]], speeds: bool, read: tuple[str, ...] | None, tmp_path: Path
@@ -548,6 +554,14 @@ def test_a_gps_fix_without_a_speed_tells_no_velocity() -> None:
         assert why in found.reason
 
 
+def test_a_gps_fix_at_rest_without_a_track_stands() -> None:
+    """Its speed is noise, to all sides; taken for a track of 0, a receiver at rest moved north by 5 cm/s."""
+    fix = gps_fix(Messages(2), S, 57.7, 11.9, speed=0.09, track=float("nan"))
+    found = DECODERS["gnss_velocity", "gps_msgs/msg/GPSFix"](fix, S, 0, "v", VelocityConfig())
+    assert isinstance(found, GnssVelocity)
+    assert found.v_world_mps[:2] == pytest.approx((0.0, 0.0))
+
+
 def test_a_climb_that_the_driver_leaves_at_0_is_none() -> None:
     """On a hill it held the height back, with a sigma of 0.3 m/s."""
     make = Messages(2)
@@ -630,3 +644,76 @@ def test_an_axis_is_read_once(kind: str, one: list[str], other: list[str], what:
 def test_blocks_that_are_not_parsed_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="gnss: no SensorConfig"):
         VesselConfig.model_validate({"sensors": {"gnss": {"kind": "gnss", "topic": "/fix"}}})
+
+
+def test_inspect_names_the_sentences_that_are_not_read(tmp_path: Path) -> None:
+    """A driver that leaves checksums out, and makers' own headings, were passed over: `inspect` said that the type of the topic is not read."""
+    make = Messages(2)
+    make.register(OTHER_TYPES[SENTENCE], SENTENCE)
+    sentence = make.t[SENTENCE]
+    bodies = ["$GPGGA,120000.00,5742.0,N,01154.0,E,1,08,0.9,5.4,M,40.0,M,,", sealed("PSAT,HPR,120000.00,10.51,0.4,-0.8,N"),
+              sealed("GPGSV,1,1,00"), "!AIVDM,1,1,,A,13u?etPv2;0n:dDPwUM1U1Cb069D,0*24"]  # fmt: skip
+    items = [
+        ("/nmea", START_NS + k * S, sentence(make.header(START_NS + k * S), body)) for k in range(5) for body in bodies
+    ]
+    found, _, _ = look(tmp_path, items, make)
+    text = render(found)
+    for named in ("GPGGA without a checksum (5)", "PSAT (5)", "GPGSV (5)", "AIVDM (5)"):
+        assert named in text
+    assert "of no type that is read" not in text
+
+
+def test_sentences_that_are_read_are_not_named_as_unread() -> None:
+    burst = (
+        sealed("GPRMC,122310.2,A,3722.425671,N,12258.856215,W,10.0,270.0,230324,,,A") + "\r\n" + sealed("HEHDT,1.0,T")
+    )
+    assert nmea.unread(burst + "\r\n" + sealed("GPGSA,A,3")) == ["GPGSA"]
+
+
+@pytest.mark.parametrize(
+    ("body", "through", "mps"),
+    [("VDVBW,4.0,1.0,A,-2.0,-0.5,A,0.1,A,0.2,A", "water", (4.0, -1.0)),
+     ("VDVBW,4.0,1.0,A,-2.0,-0.5,A,0.1,A,0.2,A", "ground", (-2.0, 0.5)),
+     ("VDVBW,4.0,,A,,,V", "water", (4.0,)), ("VMVHW,,T,,M,4.0,N,7.4,K", "water", (4.0,))],
+)  # fmt: skip
+def test_a_log_tells_speeds_ahead_and_to_port(body: str, through: str, mps: tuple[float, ...]) -> None:
+    """VBW: to starboard positive, knots; an old one ends before the speeds of the stern."""
+    said = nmea.log_velocity_mps(sealed(body), nmea.SPEEDS, through)
+    assert said == pytest.approx(tuple(v * 1852.0 / 3600.0 for v in mps))
+
+
+def test_a_speed_that_a_log_calls_invalid_is_none() -> None:
+    said = nmea.log_velocity_mps(sealed("VDVBW,4.0,0.0,A,0.0,0.0,V"), nmea.SPEEDS, "ground")
+    assert isinstance(said, Rejection)
+    assert (said.outcome, said.reason) == (Outcome.REJECTED, "VBW: its speed over ground is not valid")
+
+
+@pytest.mark.parametrize("tracks_bottom", [True, False])
+def test_a_ships_log_is_drafted_over_ground_and_through_the_water(
+    tracks_bottom: bool, run: SimulatedRun, bag: Path, tmp_path: Path
+) -> None:
+    """VBW of a Doppler log; in deep water it loses the ground."""
+    make, items, truth = Messages(2), list[Item](), run.recording.truth
+    assert truth is not None
+    make.register(OTHER_TYPES[SENTENCE], SENTENCE)
+    for m in run.recording.of(GnssPosition):
+        lat, lon, height = m.position
+        place = f"{minutes(lat, 'NS', 2)},{minutes(lon, 'EW', 3)}"
+        at = truth.at(np.array([m.stamp_ns]))
+        ahead, port, _ = at.R_world_body[0].T @ at.v_world_mps[0] * 3600.0 / 1852.0  # type: ignore[index]
+        ground = f"{ahead:.2f},{-port:.2f},A" if tracks_bottom else ",,V"
+        for said in (
+            f"GPGGA,120000.00,{place},1,09,0.9,{height:.3f},M,0.0,M,,",
+            f"VDVBW,{ahead + 0.4:.2f},{-port:.2f},A,{ground},,V,,V",
+        ):
+            items.append(
+                ("/nmea", m.stamp_ns, make.t[SENTENCE](header=make.header(m.stamp_ns, "gps"), sentence=sealed(said)))
+            )
+    _, config, text = look(tmp_path, items, make)
+    logs = [s for s in config.sensors.values() if isinstance(s, BodyVelocityConfig)]
+    assert [s.through for s in logs] == (["ground", "water"] if tracks_bottom else ["water"])
+    assert all(s.nmea == ("VDVBW",) and s.axes == ("x", "y") for s in logs)
+    (tmp_path / "vessel.yaml").write_text(text.replace("enabled: false", "enabled: true"))
+    read = read_recording(tmp_path / "run", load_config(tmp_path / "vessel.yaml", KINDS)).of(BodyVelocity)
+    fixes = len(run.recording.of(GnssPosition))
+    assert len(read) == fixes * len(logs)

@@ -12,7 +12,7 @@ import pytest
 
 from graphloc import app
 from graphloc.config import VesselConfig
-from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.factors import gnss, imu
 from graphloc.frames import Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.measurements import CompassHeading, GnssPosition
@@ -112,10 +112,12 @@ def at_two_hertz() -> SimulatedRun:
     return simulate(scenario, 4)
 
 
-def said_of(run: SimulatedRun, jump_s: tuple[float, float], turned_rad: float, before_ns: int = 0) -> list[str]:
+def said_of(
+    run: SimulatedRun, jump_s: tuple[float, float], turned_rad: float, before_ns: int = 0, late_ns: int = 0
+) -> list[str]:
     """What is said of an estimate that is right but for its heading, where the fixes are 8 m further east for a while.
 
-    `before_ns`: stamp of a state before, by a clock that was then set back.
+    `before_ns`: stamp of a state before, by a clock that was then set back. `late_ns`: by how much the fixes are stamped late.
     """
     datum, of_imu = app.choose_datum(run.recording, run.config), run.config.sensors["imu"].mount
     assert run.recording.imu is not None
@@ -126,12 +128,13 @@ def said_of(run: SimulatedRun, jump_s: tuple[float, float], turned_rad: float, b
         datum.gravity_mps2,
     )
     lever = run.config.sensors["gnss"].mount.t_body_sensor_m - of_imu.t_body_sensor_m
-    stream = SimpleNamespace(row=gnss.ROW, mount=gtsam.Pose3(gtsam.Rot3(), lever))
+    antenna = run.config.sensors["gnss"].model_copy(update={"stamp_sigma_s": 0.05 if late_ns else 0.0})
+    stream = SimpleNamespace(row=gnss.ROW, config=antenna, mount=gtsam.Pose3(gtsam.Rot3(), lever))
     problem = SimpleNamespace(
         streams={"gnss": stream}, datum=datum, links=links, R_body_imu=of_imu.R_body_sensor, t_body_imu_m=of_imu.t_body_sensor_m
     )  # fmt: skip
     begin_ns = int(run.truth.stamps_ns[0])
-    waiting = deque(m for m in run.recording.of(GnssPosition))
+    waiting = deque(replace(m, stamp_ns=m.stamp_ns + late_ns) for m in run.recording.of(GnssPosition))
     check, said = HeadingCheck(), list[str]()
     if before_ns:
         at_once: Any = SimpleNamespace(stamp_ns=before_ns)
@@ -160,6 +163,16 @@ def test_fixes_that_jump_neither_hide_a_wrong_heading_nor_make_one(
 ) -> None:
     assert len(said_of(at_two_hertz, jump_s, np.radians(70.0))) == 1
     assert said_of(at_two_hertz, jump_s, 0.0) == []
+
+
+def test_fixes_that_are_late_make_no_wrong_heading() -> None:
+    """In turns of 14 deg/s a delay of a second added as much to a heading that was 10 deg off, or hid one that was 30 deg off."""
+    loops = Scenario(
+        path="loops", duration_s=70.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=0.0
+    )
+    run = simulate(loops, 4)
+    assert said_of(run, (0.0, 0.0), np.radians(10.0), late_ns=SECOND) == []
+    assert len(said_of(run, (0.0, 0.0), np.radians(70.0), late_ns=SECOND)) == 1
 
 
 def test_a_wrong_heading_is_found_after_the_clock_was_set_back(at_two_hertz: SimulatedRun) -> None:

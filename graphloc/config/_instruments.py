@@ -95,9 +95,9 @@ class ImuConfig(SensorConfig):
 
 _TALKER = "^([A-Z]{2})?"
 Places = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(GGA|GNS|RMC|GLL)$")], ...], Field(min_length=1)]
-Headings = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(HDT|THS|HDG|HDM)$")], ...], Field(min_length=1)]
+Headings = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(HDT|THS|HDG|HDM|SHR)$")], ...], Field(min_length=1)]
 Velocities = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(VTG|RMC)$")], ...], Field(min_length=1)]
-Speeds = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "VHW$")], ...], Field(min_length=1)]
+Speeds = Annotated[tuple[Annotated[str, Field(pattern=_TALKER + "(VHW|VBW)$")], ...], Field(min_length=1)]
 SpeedAxes = Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)]
 
 
@@ -190,7 +190,7 @@ class CompassConfig(SensorConfig):
     wander_time_constant_s: Positive = 60.0
     """Correlation time of that error, s."""
     nmea: Headings = ("HDT", "THS")
-    """NMEA sentences to read, from one talker (`HEHDT`) or any (`HDT`): HDT, THS, HDG, HDM."""
+    """NMEA sentences to read, from one talker (`HEHDT`) or any (`HDT`): HDT, THS, HDG, HDM, PASHR."""
 
     @property
     def apart_ns(self) -> int:
@@ -224,13 +224,13 @@ class VelocityConfig(SensorConfig):
 class BodyVelocityConfig(SensorConfig):
     """Velocity along the vessel, of wheels, a Doppler log or a speed log: twist of `nav_msgs/Odometry` or of `gnss_velocity`'s types.
 
-    Also `std_msgs/Float64` or `Float32`, VHW in NMEA as `gnss`, and Doppler logs' own messages. All along the axes of the sensor.
+    Also `std_msgs/Float64` or `Float32`, VHW and VBW in NMEA as `gnss`, and Doppler logs' own messages. All along the axes of the sensor.
     """
 
     kind: Literal["body_velocity"] = "body_velocity"
     """Which row of the sensor table reads this block."""
     axes: SpeedAxes = ("x",)
-    """Axes of the sensor along which it measures; of a number and of VHW x alone. Wheels: [x, y], where the mount is a place that
+    """Axes of the sensor along which it measures; of a number and of VHW x alone, of VBW x and y. Wheels: [x, y], where the mount is a place that
     does not slip sideways (the rear axle of a car); x alone tells an error of the heading by its cosine only. A Doppler log: [x, y, z]."""
     through: Literal["ground", "water"] = "ground"
     """What it moves over or through. Water has a current, which is estimated. Messages that say the other are ignored."""
@@ -254,7 +254,8 @@ class BodyVelocityConfig(SensorConfig):
     current_time_constant_s: Positive = 600.0
     """How long a current stays the same, s."""
     nmea: Speeds = ("VHW",)
-    """Sentences that are read of a topic of NMEA, of one talker (`VWVHW`) or of any (`VHW`): VHW."""
+    """Sentences that are read of a topic of NMEA, of one talker (`VWVHW`) or of any (`VHW`): VHW (through the water), VBW (ahead and to
+    the side, of `through`)."""
 
     @field_validator("axes")
     @classmethod

@@ -11,7 +11,9 @@ accelerometer and the gyroscope, about 0 and not about the estimated ones, which
 right heading rho = 1; a heading that is off by e gives rho = exp(-i e). A gyroscope bias of 0.02 rad/s about the vertical turns
 s by 0.8 rad in 40 s: where the heading fits with the estimated bias taken off, nothing is reported. So a compass with a wrong
 mount or convention is told from a vessel that moves astern, sideways or with a current: there the accelerations fit the motion.
-The course over ground cannot tell these apart. Where the fixes jump, z has a step.
+The course over ground cannot tell these apart. Where the fixes jump, z has a step. Fixes that are late turn z where the vessel
+turns, by what it turns meanwhile: where their stamps may be off (`stamp_sigma_s`), and the heading fits with a term in the
+velocity of s, nothing is reported.
 """
 
 from __future__ import annotations
@@ -41,6 +43,7 @@ _APART_S = 1.0  # correlation time of the errors of fixes, at least
 _FEWEST = 15  # fixes
 _ENDS = slice(2, -2)  # fixes at which a jump would show
 _IN_A_ROW = 2  # checks that must agree before the heading is called wrong, or right again
+_LATE_S = 0.5  # 1 sigma of a delay of fixes whose stamps may be off: those that come through a gateway are by a second
 _BIASES = np.array([0.1, 9.8 * 0.005])  # 1 sigma: m/s^2, and of the rate that tilts gravity, m/s^3
 
 
@@ -135,8 +138,12 @@ class HeadingCheck:
         self._fits = self._fits + 1 if abs(found[0]) <= _TURNED_RAD else 0
         if _turned(*found):
             up = newest.pose.rotation().matrix()[2]
-            told = _off(self._fit(lag, newest, up * float(up @ lag.problem.R_body_imu @ newest.bias.gyroscope())))
-            found = told if told is not None and not _turned(*told) else found
+            drift = up * float(up @ lag.problem.R_body_imu @ newest.bias.gyroscope())
+            for by, late in ((drift, False), *(((np.zeros(3), True), (drift, True)) if self._may_be_late(lag) else ())):
+                told = _off(self._fit(lag, newest, by, late=late))
+                if told is not None and not _turned(*told):
+                    found = told
+                    break
         known = (
             float(
                 bounds_95(world_covariance(newest.pose_cov, newest.pose.rotation().matrix(), np.zeros(3))[None])[0, 2]
@@ -180,15 +187,25 @@ class HeadingCheck:
         while self._fixes and self._fixes[0].stamp_ns < begin_ns:
             self._fixes.popleft()
 
-    def _fit(self, lag: Lag, newest: Newest, drift_radps: Array, *, any_place: bool = False) -> Fit | None:
+    def _may_be_late(self, lag: Lag) -> bool:
+        """Whether the stamps of the fixes may be off; what measures whole poses has none of its own."""
+        return float(getattr(lag.problem.streams[self._sensor].config, "stamp_sigma_s", 0.0)) > 0.0
+
+    def _fit(
+        self, lag: Lag, newest: Newest, drift_radps: Array, *, any_place: bool = False, late: bool = False
+    ) -> Fit | None:
         """Return how the fixes follow the accelerations; None where there are too few.
 
         Args:
-            drift_radps: (3,) gyroscope bias to take off, body axes. any_place: the antenna is anywhere about its mount.
+            drift_radps: (3,) gyroscope bias to take off, body axes. any_place: the antenna is anywhere about its mount. late: the fixes
+                may be late, or early.
         """
         # What measures whole poses has no antenna.
         place_m = getattr(lag.problem.streams[self._sensor].config, "mount_sigma_m", 0.0) if any_place else 0.0
         at_s, felt = self._felt(lag, newest, drift_radps, place_m)
+        known = np.append(_BIASES, [place_m] if place_m else [])
+        if late:
+            felt, known = np.vstack([felt, np.gradient(felt[0], at_s)]), np.append(known, _LATE_S)
         fixes = [fix for fix in self._fixes if self._steps[0].until_ns <= fix.stamp_ns <= newest.stamp_ns]
         if at_s[-1] - at_s[0] < 0.9 * _WINDOW_S or len(fixes) < _FEWEST:
             return None
@@ -206,7 +223,6 @@ class HeadingCheck:
         moved, terms = free[:, 0], free[:, 1:]
         left = moved - terms @ np.linalg.lstsq(terms, moved, rcond=None)[0]
         variance = float(np.mean(np.abs(left) ** 2)) * len(z) / (_WINDOW_S / _APART_S)  # of a fix, as all go together
-        known = _BIASES if not place_m else np.append(_BIASES, place_m)
         information = terms.conj().T @ terms / variance + np.diag([0.0, *(1.0 / known**2)])
         rho = complex(np.linalg.solve(information, terms.conj().T @ moved / variance)[0])
         sigma = float(np.sqrt(np.linalg.inv(information)[0, 0].real))
