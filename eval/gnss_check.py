@@ -14,6 +14,7 @@ the limit is 3 sigmas, since a mix-up of geoid and ellipsoid gives far more.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +31,29 @@ from graphloc.trajectory import Trajectory
 
 _STEADY = 0.5  # RMS about the mean, as a share of it
 _HEIGHT_SIGMAS = 3.0
+_FAR_OFF = 3.0  # sigmas of the mean, from which no pose beside it is good
 _BLOCK_S, _FEWEST = 10.0, 3  # fewer blocks do not tell what hardly moves
 _PLACES = ("pose", "aerial", "apriltag", "gnss")
 
 
-def gnss_offset_warnings(
+class GnssOffset(NamedTuple):
+    """A constant offset of a receiver from the other position sensors; as text, what is said of it.
+
+    Attributes:
+        said: the line. doubt: why no pose beside it is called good; empty where it may still be chance, or is in height alone.
+    """
+
+    said: str
+    doubt: str = ""
+
+    def __str__(self) -> str:
+        return self.said
+
+
+def gnss_offsets(
     track: Trajectory, datum: Datum, recording: Recording, config: VesselConfig, antennas_off_m: Levers
-) -> list[str]:
-    """Return a line for each receiver with a constant offset from a solved track that its slow error does not explain.
+) -> list[GnssOffset]:
+    """Return the constant offset of each receiver from a solved track, where its slow error does not explain it.
 
     Args:
         track: of the body. datum: origin of world.
@@ -45,7 +61,7 @@ def gnss_offset_warnings(
         config: sensors, their slow errors and mounts.
         antennas_off_m: (3,) m each, by receiver, how far from its mount the track has its antenna, where it estimates that.
     """
-    lines = list[str]()
+    offsets = list[GnssOffset]()
     measured = {m.sensor for m in recording.measurements if m.seq >= 0}
     for name, sensor in config.of_kind("gnss").items():
         others = [
@@ -62,39 +78,42 @@ def gnss_offset_warnings(
         if len(off) < _FEWEST:
             continue
         process, lasts_s = sensor.slow_error, float(stamps[-1] - stamps[0]) / NS_PER_S
-        lines += _horizontal(name, off[:, :2], process, lasts_s, others)
+        offsets += _horizontal(name, off[:, :2], process, lasts_s, others)
         if all(m.has_height for m in fixes):
             tell = [n for n in others if config.sensors[n].tells_height] + list(config.of_kind("height"))
-            lines += _vertical(name, off[:, 2:], process, lasts_s, tell)
-    return lines
+            offsets += _vertical(name, off[:, 2:], process, lasts_s, tell)
+    return offsets
 
 
 def _horizontal(
     name: str, off_m: Array, process: SlowErrorConfig, lasts_s: float, others: Sequence[str]
-) -> Iterator[str]:
-    """Yield a line if a receiver's errors (N, 2), m, of a run of `lasts_s` are more than its slow error explains."""
+) -> Iterator[GnssOffset]:
+    """Yield the offset if a receiver's errors (N, 2), m, of a run of `lasts_s` are more than its slow error explains."""
     size, mean = _steady(off_m)
-    if size**2 >= chi2_95(2) * _mean_variance(process.horizontal_sigma_m, process.time_constant_s, lasts_s):
+    variance = _mean_variance(process.horizontal_sigma_m, process.time_constant_s, lasts_s)
+    if size**2 >= chi2_95(2) * variance:
         towards = float(heading_deg_from_yaw(np.arctan2(mean[1], mean[0])))
-        yield (
-            f"{name} has a constant offset of {size:.1f} m (towards {towards:.0f} deg) from {', '.join(others)}, more than its slow "
-            f"error of {process.horizontal_sigma_m:.1f} m (1 sigma) explains: the map, the survey, the datum or a lever arm is "
-            "off by that much, or the receiver is; the track follows the others"
+        seen = f"{name} has a constant offset of {size:.1f} m (towards {towards:.0f} deg) from {', '.join(others)}"
+        said = (
+            f"{seen}, more than its slow error of {process.horizontal_sigma_m:.1f} m (1 sigma) explains: the map, the survey, the datum "
+            "or a lever arm is off by that much, or the receiver is; the track follows the others"
         )
+        yield GnssOffset(said, seen if size**2 > _FAR_OFF**2 * variance else "")
 
 
 def _vertical(
     name: str, off_m: Array, process: SlowErrorConfig, lasts_s: float, others: Sequence[str]
-) -> Iterator[str]:
+) -> Iterator[GnssOffset]:
     """Yield the same of its errors (N, 1) in height; `others`: what else tells the height."""
     size, mean = _steady(off_m)
     variance = _mean_variance(process.vertical_sigma_m, process.time_constant_s, lasts_s)
     if others and size**2 >= _HEIGHT_SIGMAS**2 * variance:
-        yield (
+        said = (
             f"{name} has a constant offset of {size:.1f} m ({'up' if mean[0] > 0.0 else 'down'}) from {', '.join(others)}, more "
             f"than its slow error of {process.vertical_sigma_m:.1f} m in height (1 sigma) explains: one may be above the geoid, "
             "the other above the ellipsoid"
         )
+        yield GnssOffset(said)
 
 
 def _steady(off_m: Array) -> tuple[float, Array]:

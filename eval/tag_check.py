@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import VesselConfig
 from graphloc.frames import Array
+from graphloc.frontends.tags.pose import poses_of
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import GnssPosition, TagSighting, world_from_fixes
 from graphloc.recording import Recording
@@ -41,6 +42,7 @@ _UPRIGHT = 3.0  # rise over way of an offset of heights; the rest, without tags,
 # Share of the sightings of a tag in which the vessel is behind its plane, by more than a fix is off; and by how much more than the
 # camera's lever arm she may be farther from it than it looks: else it is not the facing that is wrong, but the place.
 _BEHIND, _BEHIND_M, _PLACE_M = 0.5, 3.0, 5.0
+_FACES_DEG = 30.0  # by which a face is turned at least, for an angle of another convention
 # Share of what her distance and that which it looks scatter by in sum, up to which their difference scatters.
 _ALONG = 0.5
 
@@ -61,6 +63,9 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
     behind = _seen_from_behind(sightings, recording, config, solution)
     if behind:  # then nothing else that tags say can be judged, mounts included
         return behind
+    facing = _facing_elsewhere(sightings, rows, config, solution)
+    if facing:  # likewise
+        return facing
     turned = _turned_mounts(sightings, rows, solution)
     if turned:  # then nothing else that tags say can be judged
         return turned
@@ -171,6 +176,60 @@ def _faces_away(seen: Array) -> bool:
         return False
     away_m, looks_m, _ = seen[behind].T
     return float(np.std(away_m - looks_m)) < _ALONG * float(np.std(away_m + looks_m))
+
+
+def _facing_elsewhere(
+    sightings: list[TagSighting], rows: Mapping[int, LedgerRow], config: VesselConfig, solution: Solution
+) -> list[str]:
+    """Return a line for each refused tag that stands where the survey says and faces another way, as by an angle of another convention.
+
+    A camera's mount that is turned shows the tag elsewhere, too: what puts it nearer to its place is taken for the cause.
+    """
+    seen: dict[Key, list[tuple[float, float, float]]] = defaultdict(list)
+    doubted = [m for m in sightings if _weight(rows, m) < 0.5]
+    if len(doubted) < max(_FEWEST, _DOUBTED * len(sightings)):
+        return []
+    for m, p, R in zip(doubted, *solution.trajectory.poses_at(stamps_of(doubted)), strict=True):
+        camera, looks = p + R @ m.t_body_camera_m, R @ m.R_body_camera
+        for k, tag in enumerate(m.tags):  # each by itself: no pose explains several
+            corners, own = slice(4 * k, 4 * k + 4), slice(8 * k, 8 * k + 8)
+            middle = m.points_m[corners].mean(axis=0)
+            by_it = [
+                (Rotation.from_matrix(looks @ pose.R).as_rotvec(degrees=True), pose)
+                for pose in poses_of(m.points_m[corners], m.rays[corners], m.cov[own, own])
+            ]
+            if by_it:
+                turn, pose = min(
+                    by_it, key=lambda found: float(np.hypot(*found[0][:2]))
+                )  # an upright tag stays upright
+                by_facing = camera + looks @ (pose.R @ middle + pose.t_m) - middle
+                by_mount = camera + pose.R.T @ pose.t_m
+                seen[m.sensor, tag].append((turn[2], *(float(np.linalg.norm(off)) for off in (by_facing, by_mount))))
+    lines = []
+    for key, found in sorted(seen.items()):
+        turn_deg, by_facing_m, by_mount_m = np.array(found).T
+        turns = Rotation.from_euler("z", turn_deg[:, None], degrees=True)
+        usual = turns.mean()
+        usual_deg = float(usual.as_rotvec(degrees=True)[2])
+        scatter_deg = float(np.degrees(np.median((usual.inv() * turns).magnitude())))
+        nearer = np.median(by_facing_m) < _ALONG * np.median(by_mount_m)
+        if len(found) >= _FEWEST and nearer and abs(usual_deg) > max(_FACES_DEG, scatter_deg / _STEADY):
+            lines.append(_faces_elsewhere(key, usual_deg, config))
+    return lines
+
+
+def _faces_elsewhere(key: Key, turn_deg: float, config: VesselConfig) -> str:
+    """Return the line on a tag whose face is seen turned (deg, counter-clockwise) from how the survey has it."""
+    sensor, (family, number) = key
+    survey = config.of_kind("apriltag")[sensor].surveyed
+    (tag,) = (tag for tag in survey.tags if (tag.family, tag.id) == (family, number))
+    would = ""
+    if tag.facing_deg is not None:
+        would = f": facing_deg {(tag.facing_deg - turn_deg) % 360.0:.0f} instead of {tag.facing_deg:.0f} would do"
+    return (
+        f"{sensor}: {survey.called(family, number)}: it stands where the survey says, and faces {abs(turn_deg):.0f} deg elsewhere{would} "
+        "(from north, or the y axis of its dock, clockwise)"
+    )
 
 
 def _key(m: TagSighting) -> Key:

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from graphloc import app
-from graphloc.eval.gnss_check import _mean_variance, gnss_offset_warnings
+from graphloc.eval.gnss_check import _mean_variance, gnss_offsets
 from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition, Measurement, PoseFix
+from graphloc.recording import Recording
+from graphloc.solution import Health
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import S
 from tests.slowly import simulate_slowly, sparsely
@@ -47,7 +49,7 @@ def said(
     )
     pose = run.recording.of(PoseFix)[0]
     recording = replace(run.recording, measurements=(pose, *fixes))
-    return gnss_offset_warnings(track, DATUM, recording, run.config, antennas_off_m)
+    return [str(offset) for offset in gnss_offsets(track, DATUM, recording, run.config, antennas_off_m)]
 
 
 def process(rng: np.random.Generator, lasts_s: int, every_s: int) -> Array:
@@ -97,19 +99,26 @@ def test_an_antenna_that_is_found_elsewhere_is_no_offset(run: SimulatedRun) -> N
     assert said(run, np.tile(off_m[:2], (60, 1)), up_m=36.0, gnss=off_m) == []
 
 
-def test_poses_all_off_by_five_metres_are_reported(run: SimulatedRun) -> None:
-    """3 m east and 4 m north: the receiver is said to stand 5 m off the other way, west and south."""
+def with_poses_off(run: SimulatedRun, east_m: float, north_m: float) -> Recording:
+    """The recording with all poses elsewhere."""
     moved: list[Measurement] = []
     for m in run.recording.measurements:
         if isinstance(m, PoseFix):
             modes = tuple(
-                replace(mode, value=np.asarray(mode.value) + np.array([3.0, 4.0, *[0.0] * (len(mode.value) - 2)]))
+                replace(
+                    mode, value=np.asarray(mode.value) + np.array([east_m, north_m, *[0.0] * (len(mode.value) - 2)])
+                )
                 for mode in m.modes
             )
             moved.append(replace(m, modes=modes))
         else:
             moved.append(m)
-    recording = replace(run.recording, measurements=tuple(moved))
+    return replace(run.recording, measurements=tuple(moved))
+
+
+def test_poses_all_off_by_five_metres_are_reported(run: SimulatedRun) -> None:
+    """3 m east and 4 m north: the receiver is said to stand 5 m off the other way, west and south."""
+    recording = with_poses_off(run, 3.0, 4.0)
     for solved in (app.smooth_recording(recording, run.config), app.replay_recording(recording, run.config)):
         lines = [w for w in solved.recording.warnings if "constant offset" in w]
         found = re.search(r"gnss has a constant offset of (\d\.\d) m \(towards (\d+) deg\) from matcher", lines[0])
@@ -117,3 +126,20 @@ def test_poses_all_off_by_five_metres_are_reported(run: SimulatedRun) -> None:
         assert float(found[1]) == pytest.approx(5.0, abs=0.3)
         assert float(found[2]) == pytest.approx(180.0 + np.degrees(np.arctan2(3.0, 4.0)), abs=4.0)
     assert not [w for w in app.smooth_recording(run.recording, run.config).recording.warnings if "constant offset" in w]
+
+
+@pytest.mark.parametrize("off_m", [8.0, 26.0])
+def test_no_pose_is_good_beside_a_receiver_that_is_far_off_all_the_while(off_m: float, run: SimulatedRun) -> None:
+    """A tag that hangs 26 m from where its survey has it drew the track along, and half of the poses were called good."""
+    solved = app.smooth_recording(with_poses_off(run, off_m, 0.0), run.config).solution
+    assert Health.GOOD not in solved.health
+
+
+def test_no_pose_is_good_online_beside_a_receiver_that_agrees_only_by_an_error_that_it_hardly_has(
+    run: SimulatedRun,
+) -> None:
+    """That it does not agree any more was said after ten seconds."""
+    solved = app.replay_recording(with_poses_off(run, 26.0, 0.0), run.config).solution
+    followed = solved.trajectory.p_world_m[:, 0] - run.truth.at(solved.trajectory.stamps_ns).p_world_m[:, 0] > 20.0
+    assert followed.any()
+    assert not any(h is Health.GOOD for h, f in zip(solved.health, followed, strict=True) if f)

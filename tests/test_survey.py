@@ -223,6 +223,16 @@ def test_an_absolute_path_is_taken_as_it_is(tmp_path: Path) -> None:
     assert len(tags.surveyed.tags) == 1
 
 
+@pytest.mark.parametrize("place", ["[57.7012, 11.9034, 3.0]", "[11.9034, 57.7012, 43.0]"])
+def test_a_survey_in_degrees_is_refused(tmp_path: Path, place: str) -> None:
+    """Three tags were in one place, by it, and a run of them was 11 m off and told to look at their sizes."""
+    path = written(tmp_path, entry() + entry(id="4", xyz_m=place).removeprefix("tags:\n"))
+    config = VesselConfig.model_validate({"sensors": {}, "datum": UTM_33})
+    config = config.model_copy(update={"sensors": {"tags": AprilTagConfig(survey="tags.yaml")}})
+    with pytest.raises(ConfigError, match=rf"{path}: tag 4: its xyz_m is a latitude and a longitude: give metres"):
+        with_surveys(config, tmp_path)
+
+
 def test_a_sensor_without_a_survey_says_what_it_needs(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"sensors\.bow\.survey: name the tags\.yaml"):
         with_surveys(vessel(bow=AprilTagConfig()), tmp_path)

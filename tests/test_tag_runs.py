@@ -364,6 +364,22 @@ def test_tags_that_face_the_other_way_in_the_survey_are_named() -> None:
     assert "elsewhere than its mount says" not in said
 
 
+def test_tags_whose_faces_are_given_in_another_convention_are_named() -> None:
+    """`facing_deg` counted from east, a quarter turn off: it was said that the camera looks elsewhere."""
+
+    def turned(tag: TagConfig) -> TagConfig:
+        heading = float(np.degrees(np.arctan2(*tag.R_frame_tag[:2, 2])))
+        return tag.model_copy(update={"rpy_deg": None, "facing_deg": heading + 90.0})
+
+    said = dock(tag=turned, lasts_s=20.0, rate_hz=1.0, route_s=30.0).said
+    lines = [line for line in said.splitlines() if "it stands where the survey says, and faces" in line]
+    assert [line.split(":")[1].strip() for line in lines] == ["tag 226", "tag 227", "tag 228"]
+    for line in lines:
+        right, told = (float(part.split()[-1]) for part in line.split(" would do")[0].split(" instead of "))
+        assert (told - right) % 360.0 == pytest.approx(90.0, abs=5.0)
+    assert "elsewhere than its mount says" not in said
+
+
 def test_a_quay_that_is_off_is_not_taken_for_tags_that_face_the_other_way() -> None:
     """By 13 m towards the water, seen at the berth alone: by the fixes the vessel is behind it, about as far as it looks."""
 

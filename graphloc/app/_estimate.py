@@ -14,7 +14,7 @@ from graphloc.config import VesselConfig, load_config
 from graphloc.errors import InputError, SolveError
 from graphloc.eval import calibrate, ekf, holdout
 from graphloc.eval.digerud import run_digerud
-from graphloc.eval.gnss_check import gnss_offset_warnings
+from graphloc.eval.gnss_check import GnssOffset, gnss_offsets
 from graphloc.eval.match_picture import Gallery
 from graphloc.eval.mount_check import MountDoubt, mount_doubts
 from graphloc.eval.simulate import SimulatedRun
@@ -97,9 +97,10 @@ def smooth_recording(
         filters = (beside, *filters)
     tags, said = found_tags.about_tags(recording, config, solution)
     mounts, offsets = _track_warnings(solution, recording, config)
-    for doubt in (*recording.clock_doubts[:1], *(d.seen for d in mounts[:1])):
+    far_off = (offset.doubt for offset in offsets if offset.doubt)
+    for doubt in (*recording.clock_doubts[:1], *(d.seen for d in mounts[:1]), *far_off):
         solution = solution.doubted(doubt)
-    said += [*map(str, mounts), *offsets, *([never] if never else [])]
+    said += [*map(str, mounts), *map(str, offsets), *([never] if never else [])]
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution,
         held=_when_measured(held, solution),
@@ -174,10 +175,10 @@ def _filters(
 
 def _track_warnings(
     solution: Solution, recording: Recording, config: VesselConfig
-) -> tuple[list[MountDoubt], list[str]]:
+) -> tuple[list[MountDoubt], list[GnssOffset]]:
     """What a solved track, offline or online, tells of the configuration: of how the craft lies and goes, and of its sensors."""
     track = solution.trajectory
-    offsets = gnss_offset_warnings(track, solution.datum, recording, config, solution.antennas_off_m)
+    offsets = gnss_offsets(track, solution.datum, recording, config, solution.antennas_off_m)
     return mount_doubts(track, recording, config), offsets
 
 
@@ -207,7 +208,7 @@ def replay_recording(
     mounts, offsets = _track_warnings(solution, recording, config)
     if recording.clock_doubts:
         solution = solution.doubted(recording.clock_doubts[0])
-    said = [*suspect_tags(recording, config, solution), *map(str, mounts), *offsets]
+    said = [*suspect_tags(recording, config, solution), *map(str, mounts), *map(str, offsets)]
     run = Run(recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution)
     return made_comparable(_with_underlay(run, scans))
 

@@ -8,9 +8,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from graphloc.config import VesselConfig
 from graphloc.errors import ConfigError
-from graphloc.frames import Datum
+from graphloc.frames import Datum, Geodetic
 from graphloc.frontends._part import Bags
 from graphloc.frontends.tags.grid import in_world
 from graphloc.frontends.tags.sightings import camera_info_topic, sightings_of_bag
@@ -18,8 +20,9 @@ from graphloc.frontends.tags.sizes import REFUSED, size_factors
 from graphloc.gather._gathering import Gathering
 from graphloc.measurements import TagSighting
 from graphloc.recording import Progress, Recording
-from graphloc.survey import Survey, load_survey
+from graphloc.survey import WORLD, Survey, TagConfig, load_survey
 
+_NEAR_DEG = 0.05  # a tag that many metres from where a latitude and a longitude would be is one by chance
 _REASONS = 8  # that are said, of those why something was refused
 _DOUBTFUL = 0.5  # share of the images with tags, above which those that a limit refuses are said
 
@@ -42,12 +45,26 @@ def with_surveys(config: VesselConfig, folder: Path) -> VesselConfig:
 
 def _in_world(survey: Survey, config: VesselConfig, path: Path) -> Survey:
     """Return a survey in world; `path` is named in errors."""
+    if config.datum and (tag := _in_degrees(survey, config.datum.geodetic)):
+        raise ConfigError(
+            f"{path}: tag {tag.id}: its xyz_m is a latitude and a longitude: give metres east, north, up from the datum, or those of a `grid`"
+        )
     if survey.grid and config.datum is None:
         raise ConfigError(f"{path}: a survey in a grid needs a `datum:` in vessel.yaml, any place near by")
     try:
         return in_world(survey, Datum(config.datum.geodetic)) if config.datum else survey
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from None
+
+
+def _in_degrees(survey: Survey, datum: Geodetic) -> TagConfig | None:
+    """Return a tag of world whose place is given as the datum's latitude and longitude, to some km; None if there is none."""
+    here = np.array([datum.latitude_deg, datum.longitude_deg])
+    for tag in () if survey.grid else survey.tags:
+        place = np.array(tag.xyz_m[:2])
+        if tag.frame == WORLD and min(np.abs(place - here).max(), np.abs(place - here[::-1]).max()) < _NEAR_DEG:
+            return tag
+    return None
 
 
 def with_sightings(recording: Recording, config: VesselConfig, bags: Bags, progress: Progress) -> Recording:

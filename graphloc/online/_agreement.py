@@ -10,9 +10,8 @@ from graphloc.graph import Attachment
 from graphloc.measurements import Measurement
 from graphloc.online._live import LiveStream, LiveTimeline
 from graphloc.position_jumps import MEAN_S
-from graphloc.solve._decide import AGREES, Verdict
+from graphloc.solve._decide import AGREES, CREDIBLE, Verdict, far_sigmas
 
-_CREDIBLE = 6.0  # sigmas of a slow error: a sensor that agrees only by a larger one does not really agree
 _USUAL = 3.0  # sigmas of a jumping slow error: beyond them the level that it jumped from may be the wrong one
 _FEW = 8  # absolute measurements in a row must disagree; fewer are no sign
 # Of disagreement, until the estimate is lost; measurements of one sensor in a row that must disagree.
@@ -26,11 +25,13 @@ class Agreement:
 
     Attributes:
         agreed_ns: stamp of the last measurement that agreed, by sensor.
+        incredible: sensors whose last one agreed only by a slow error that is hardly possible.
     """
 
     def __init__(self, timeline: LiveTimeline) -> None:
         self._timeline = timeline
         self.agreed_ns: dict[str, int] = {}
+        self.incredible: set[str] = set()
         # Stamps of the first few absolute measurements that disagreed since the last that agreed.
         self._refused: list[int] = []
         self._denied: dict[str, int] = {}  # by sensor: how many in a row disagreed, whatever slow error is allowed
@@ -45,7 +46,9 @@ class Agreement:
         agrees = verdict is not None and verdict.weight >= AGREES
         self._denied[stream.name] = 0 if agrees else self._denied.get(stream.name, 0) + 1
         if verdict is not None and agrees:
-            self._note_level(m.stamp_ns, usual=_jumped(stream, verdict.at) <= _USUAL)
+            far = far_sigmas(stream.slow, verdict.at)
+            self._note_level(m.stamp_ns, usual=far <= _USUAL)
+            (self.incredible.add if far > CREDIBLE else self.incredible.discard)(stream.name)
         if verdict is not None and agrees and _credible(stream, verdict.at):
             self.agreed_ns[stream.name] = max(m.stamp_ns, self.agreed_ns.get(stream.name, m.stamp_ns))
             self._refused = [stamp for stamp in self._refused if stamp > m.stamp_ns]
@@ -74,11 +77,12 @@ class Agreement:
     def marked(self) -> _Mark:
         """Return the state, for `back_to`."""
         levels = self._usual_ns, self._jumped_ns, self._told_ns
-        return dict(self.agreed_ns), list(self._refused), dict(self._denied), *levels
+        return dict(self.agreed_ns), set(self.incredible), list(self._refused), dict(self._denied), *levels
 
     def back_to(self, mark: _Mark) -> None:
         """Forget what was noted since `marked`: it agreed with choices that were given up."""
-        self.agreed_ns, self._refused, self._denied, self._usual_ns, self._jumped_ns, self._told_ns = mark
+        self.agreed_ns, self.incredible, self._refused, self._denied = mark[:4]
+        self._usual_ns, self._jumped_ns, self._told_ns = mark[4:]
 
     def inherit(self, before: Agreement) -> None:
         """Take over when each sensor last agreed, and since when one has been at its usual or another level.
@@ -122,19 +126,11 @@ class Agreement:
         return jumped_s if jumped_s > float(np.clip(end - begin, *_JUMPED_S)) else 0.0
 
 
-_Mark = tuple[dict[str, int], list[int], dict[str, int], tuple[int, int] | None, int | None, int]
+_Mark = tuple[dict[str, int], set[str], list[int], dict[str, int], tuple[int, int] | None, int | None, int]
 
 
 def _credible(stream: LiveStream, at: Attachment) -> bool:
     """Whether a sensor agrees by a slow error of plausible size."""
     if stream.slow is None or at.slow_value is None:
         return True
-    return bool((np.abs(at.slow_value) <= _CREDIBLE * stream.slow.sigma).all())
-
-
-def _jumped(stream: LiveStream, at: Attachment) -> float:
-    """Return how many sigmas the jumping slow error of a sensor is; 0 where it has none."""
-    if stream.slow is None or at.slow_value is None:
-        return 0.0
-    far = stream.slow.far_axes
-    return float(np.linalg.norm(at.slow_value[far] / stream.slow.sigma[far]))
+    return bool((np.abs(at.slow_value) <= CREDIBLE * stream.slow.sigma).all())

@@ -30,7 +30,7 @@ from graphloc.online._unmodelled import BeforeStart, ErrorSizes, UnmodelledError
 from graphloc.online._window import Window
 from graphloc.position_jumps import why_in_doubt
 from graphloc.solve._decide import AGREES
-from graphloc.solve._health import why_late
+from graphloc.solve._health import why_incredible, why_late
 from graphloc.solve._imu_noise import log_likelihood
 from graphloc.solve._warnings import noisier_warning
 from graphloc.solve._wrong_imu import most_motion
@@ -249,7 +249,10 @@ class Lag:
         return [n for n, s in streams if s.may_jump and s.receiver.jump.jumps != s.jumps]
 
     def in_doubt(self, stamp_ns: int) -> str:
-        """Return why the health cannot be good at a stamp: the only position sensor has jumped, or scans are stamped far off; empty where neither is."""
+        """Return why the health cannot be good at a stamp; empty where nothing is wrong.
+
+        The only position sensor has jumped, scans are stamped far off, or a sensor agrees only by a slow error that is hardly possible.
+        """
         streams = self.problem.streams.items()  # where a slow error is left out, the bounds include it
         doubtful = [n for n, s in streams if (s.left_out is None or s.jumps) and s.receiver.jump.doubtful(stamp_ns)]
         late = [
@@ -257,7 +260,8 @@ class Lag:
             for n, s in streams
             if s.slow is not None and s.slow.late is not None and TIME_OFFSET in s.receiver.far_off
         ]
-        return "; ".join([*map(why_in_doubt, doubtful), *map(why_late, late)])
+        incredible = sorted(self._agreement.incredible)
+        return "; ".join([*map(why_in_doubt, doubtful), *map(why_late, late), *map(why_incredible, incredible)])
 
     @property
     def denied(self) -> Mapping[str, int]:

@@ -25,7 +25,7 @@ from graphloc.build import Decided, Decisions, Judged, Problem, Sited, Stream, T
 from graphloc.chi2 import chi2_95
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision, Residual
+from graphloc.graph import Attachment, Decision, Residual, SlowProcess
 from graphloc.solve._best_chain import best_chain
 from graphloc.solve._hypotheses import log_evidence_of, sequence_of
 from graphloc.solve._prediction import Prediction, predict_residuals, prediction_of
@@ -47,6 +47,7 @@ _GENTLEST = {
 }
 _CONVEXITY = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
 _WIDEST = 1e9  # sigmas: larger residuals (0.1 mm stated, 100 km off) count the same
+CREDIBLE = 6.0  # sigmas of a slow error: a sensor that agrees only by a larger one does not really agree
 AGREES = 0.5  # a weight from which a measurement counts as used, and its sensor as agreeing
 NEGLIGIBLE = 1e-3  # a weight below this leaves the measurement out of the graph
 
@@ -86,6 +87,13 @@ class Verdict:
         """Expectation of its weighted square."""
         expected = self.residual.expected_nis
         return (len(self.residual.raw) if expected is None else expected) * self.weight
+
+
+def far_sigmas(slow: SlowProcess | None, at: Attachment) -> float:
+    """Return how many sigmas the part of a sensor's slow error is that may jump; 0 where it has none."""
+    if slow is None or at.slow_value is None:
+        return 0.0
+    return float(np.linalg.norm(at.slow_value[slow.far_axes] / slow.sigma[slow.far_axes]))
 
 
 # By (stream number, measurement index).

@@ -18,7 +18,7 @@ from graphloc.frames import Array
 from graphloc.position_jumps import LASTS_S, why_in_doubt
 from graphloc.solution import Cause, Health, HealthReason, SolveStats
 from graphloc.solve._batch import BatchResult
-from graphloc.solve._decide import AGREES, Verdict
+from graphloc.solve._decide import AGREES, CREDIBLE, Verdict, far_sigmas
 from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE
 from graphloc.trajectory import Trajectory, bounds_95
 
@@ -44,6 +44,11 @@ def why_late(sensor: str) -> str:
     return f"the stamps of {sensor} are far off what stamp_sigma_s allows for"
 
 
+def why_incredible(sensor: str) -> str:
+    """Return why no pose is called good beside a sensor that agrees only by a slow error which is hardly possible."""
+    return f"{sensor} agrees only by more than {CREDIBLE:g} sigmas of its slow error: it contradicts the others"
+
+
 def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[str]:
     """Why each state cannot be called good; empty where nothing speaks against it."""
     stamps_ns, why = problem.timeline.stamps_ns, ""
@@ -63,12 +68,34 @@ def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[st
             for at_ns in stream.position_jumps[0]:
                 for k in np.flatnonzero(np.abs(stamps_ns - at_ns) < LASTS_S * 1e9):
                     said[int(k)] = why_in_doubt(stream.name)
+        if not why and stream.row.absolute and stream.slow is not None:
+            for k in np.flatnonzero(_beside_incredible(problem, stream, result.verdicts)):
+                said[int(k)] = why_incredible(stream.name)
     return said
+
+
+def _beside_incredible(problem: Problem, stream: Stream, verdicts: dict[tuple[int, int], Verdict]) -> NDArray[np.bool_]:
+    """Return at which states (N,) the newest measurement of a sensor that agrees does so only by a slow error which is hardly possible.
+
+    Before the first one, it is the one to come: a smoother knows it.
+    """
+    own = ((m.stamp_ns, verdicts[stream.number, i]) for i, m in enumerate(stream.measurements))
+    agrees = [(stamp_ns, far_sigmas(stream.slow, v.at) <= CREDIBLE) for stamp_ns, v in own if v.weight >= AGREES]
+    stamps_ns = problem.timeline.stamps_ns
+    if not agrees:
+        return np.zeros(len(stamps_ns), dtype=bool)
+    at_ns, right = (np.array(column) for column in zip(*agrees, strict=True))
+    return np.asarray(~right[np.maximum(np.searchsorted(at_ns, stamps_ns, side="right") - 1, 0)])
 
 
 def since_agreed(problem: Problem, stream: Stream, verdicts: dict[tuple[int, int], Verdict]) -> Array:
     agreed = np.array(
-        [m.stamp_ns for i, m in enumerate(stream.measurements) if verdicts[(stream.number, i)].weight >= AGREES],
+        [
+            m.stamp_ns
+            for i, m in enumerate(stream.measurements)
+            if (verdict := verdicts[(stream.number, i)]).weight >= AGREES
+            and far_sigmas(stream.slow, verdict.at) <= CREDIBLE
+        ],
         dtype=np.int64,
     )
     stamps = problem.timeline.stamps_ns
