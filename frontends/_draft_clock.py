@@ -21,6 +21,7 @@ from graphloc.frontends._reports import (
     Inspection,
     MountedTopic,
     TopicReport,
+    Vec,
     VelocityReport,
 )
 from graphloc.frontends.decode import UNSTAMPED
@@ -30,6 +31,8 @@ _FILTERED_SIGMA_MPS = 1.0
 _OWN_CLOCK_S = 10.0  # no message takes as long
 _FEWEST_STAMPS = 10  # that tell of a clock
 _STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma: a receiver's stamps; recording times instead of these
+# Fixes by NMEA are stamped as much after the times that they tell; those of whole seconds by anything up to a second.
+_LEAST_AFTER_S, _MOST_AFTER_S, _EVEN_S = 0.1, 1.0, 0.5
 _STAMPS = "stamped when measured, or later? estimated with the run; 0 where a receiver's clock stamps"
 _ESTIMATED = ("gnss", "gnss_velocity")  # whose delay is, with the run
 _SET = ("imu", "gnss", "gnss_velocity", "body_velocity", "compass")  # whose clocks are set; poses may take their time
@@ -98,6 +101,12 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
         whose = f"the motion of {by}, taken for the same receiver's," if by else "its motion"
         fits = "its turns fit the gyro's" if kind == "compass" else f"what the IMU feels fits {whose}"
         why.append(f"{fits} {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
+    after = _after(kind, topic, inspection) if not why else None
+    if after is not None:
+        offset_s, sigma_s = -after[1], max(_ON_ITS_WAY_S, 0.5 * after[1])
+        why.append(
+            f"its sentences tell a time {after[1]:.2f} s ({after[0]:.2f} to {after[2]:.2f}) before they are stamped: right if the computer's clock is"
+        )
     lines = [f"  time_offset_s: {offset_s:.3f}  # guess: {'; '.join(why)}"] if why else []
     fixes_late_s = next((r.late_s[0] for r in inspection.gnss if r.late_s), 0.0)
     if kind == "gnss_velocity" and late is not None and late[0] < fixes_late_s - MOST_ON_ITS_WAY_S:
@@ -112,6 +121,21 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
         sigma_s = max(sigma_s, abs(hinted[0]) if hinted else 0.0)
         lines.append(f"  stamp_sigma_s: {sigma_s:.2f}  # guess: {_STAMPS}{said}")
     return lines
+
+
+def _after(kind: str, topic: str, inspection: Inspection) -> Vec | None:
+    """Return how long after the times that its fixes tell a topic of NMEA is stamped, s; None where that is no delay of messages.
+
+    A computer's clock that nothing sets may be as far off by chance: what the IMU feels is believed rather, even a hint.
+    """
+    told = [t.after_s for t in inspection.topics if t.topic.partition(" ")[0] == topic and t.after_s]
+    if kind not in _ESTIMATED or not told:
+        return None
+    after = min(told, key=lambda points: points[2] - points[0])
+    if not _LEAST_AFTER_S <= after[1] <= _MOST_AFTER_S or after[2] - after[0] > _EVEN_S:
+        return None
+    hinted = next((r.hinted_s for r in inspection.gnss if r.topic.partition(" ")[0] == topic and r.hinted_s), None)
+    return None if hinted and abs(hinted[0] + after[1]) > 2.0 * hinted[1] else after
 
 
 def clock_lines(inspection: Inspection) -> list[str]:

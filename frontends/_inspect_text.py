@@ -12,6 +12,7 @@ from graphloc.plain import aligned
 from graphloc.time import utc_text
 
 _MOST_NAMED = 12  # sentences that are not read
+_MOST_AFTER_S = 60.0  # by which a clock that is set is off
 # How the draft names an odometry or pose topic, by its role.
 _DRAFTED = {"truth": "truth_topic", "check_speed": "check_speed_topic", "pose": "a sensor of kind pose, switched off"}
 
@@ -91,6 +92,10 @@ def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
         if t.recorded:
             lines.append(
                 f"{t.topic}: its headers hold no stamps (all zero, all the same, or whole seconds): recording times are used"
+            )
+        if t.after_s and abs(t.after_s[1]) < _MOST_AFTER_S:
+            lines.append(
+                f"{t.topic}: stamped {t.after_s[1]:.2f} s ({t.after_s[0]:.2f}..{t.after_s[2]:.2f}) after the time that it tells"
             )
         if t.unread:
             named = [f"{name} ({n})" for name, n in islice(t.unread.items(), _MOST_NAMED)]

@@ -60,6 +60,7 @@ class TopicReport:
         recorded: whether the headers hold no stamps, or whole seconds only, so that the recording times stand for them here.
         latency_s: recording time minus header stamp: 5 %, 50 %, 95 % points; without what the clock gains.
         drift_ppm: by how much the clock runs fast, where that is clear; else 0.
+        after_s: of a place by NMEA, how long after the time that it tells it is stamped, or recorded: 5 %, 50 %, 95 % points.
         unread: of NMEA, the sentences that no sensor reads, by name, the most frequent one first, and how many there are of each.
     """
 
@@ -79,6 +80,7 @@ class TopicReport:
     recorded: bool = False
     latency_s: Vec | None = None
     drift_ppm: float = 0.0
+    after_s: Vec | None = None
     unread: dict[str, int] = field(default_factory=dict)
 
 

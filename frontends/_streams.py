@@ -149,6 +149,7 @@ SENTENCES: dict[str, tuple[str, Callable[[str, str], Row | None]]] = {
 }
 _SATELLITES = re.compile("(G[A-Z]|BD)[A-Z]{3}")  # a talker that names what a receiver sees
 _BESIDE, _BY_CHANCE = 0.75, 0.2  # steps: a sentence said at the same time; the share of those that one receiver may say
+_DAY_S, _FEWEST_TIMES = 86_400.0, 20
 _AS_OFTEN = 0.8  # of the sentences with a velocity, from which VTG says what RMC says; some receivers leave it empty, or say it every other time
 COURSE, HEADING = " (course, speed)", " (heading)"
 """At the end of the name of a stream: what RMC, a GPSFix, or a maker's message, says beside a place."""
@@ -309,8 +310,33 @@ class TopicData:
         return len(self._stamps)
 
 
-def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree, dict[str, Counter[str]]]:
-    """Read all topics of the types in `ROWS` and `VENDORS`, the static transforms, and by topic how many sentences of NMEA nothing reads.
+@dataclass(frozen=True, slots=True)
+class Sentences:
+    """What NMEA tells beside the streams.
+
+    Attributes:
+        unread: by topic how many sentences nothing reads, by name. after_s: by stream ('TOPIC GPGGA') how long after the time that a
+            place tells it is stamped, or recorded where it has no stamp, s, within half a day.
+    """
+
+    unread: dict[str, Counter[str]] = field(default_factory=dict)
+    after_s: dict[str, list[float]] = field(default_factory=dict)
+
+    def spread_s(self, stream: str) -> tuple[float, float, float] | None:
+        """Return the 5 %, 50 % and 95 % points of `after_s` of a stream, of all its talkers; None where too few tell."""
+        topic, _, said = stream.partition(" ")
+        told = [t for sentence in said.split("+") for t in self.after_s.get(f"{topic} {sentence}", ())]
+        if len(told) < _FEWEST_TIMES:
+            return None
+        about = np.median(told)  # not about noon
+        low, middle, high = np.percentile(
+            np.remainder(np.array(told) - about + _DAY_S / 2.0, _DAY_S) - _DAY_S / 2.0, [5.0, 50.0, 95.0]
+        )
+        return float(about + low), float(about + middle), float(about + high)
+
+
+def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree, Sentences]:
+    """Read all topics of the types in `ROWS` and `VENDORS`, the static transforms, and what NMEA tells beside these.
 
     An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type; 'TOPIC GPGGA+GNGGA' of a
     receiver that changes its talker. RMC gives another one of velocities, named 'TOPIC GPRMC (course, speed)', where it holds any and no
@@ -318,14 +344,14 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree, dict[str, Count
     velocities through water are one named 'TOPIC (through water)', what a filter made one named 'TOPIC (of a filter)'.
     """
     streams, tree = _empty_streams(bag), StaticTree()
-    unread = _fill(streams, tree, bag)
+    sentences = _fill(streams, tree, bag)
     tree.settle()
     _join_talkers(streams)
     for name in _of_no_use(streams):
         del streams[name]
     for stream in streams.values():
         stream.settle()
-    return [_named_as_filters(stream) for stream in streams.values()], tree, unread
+    return [_named_as_filters(stream) for stream in streams.values()], tree, sentences
 
 
 def _empty_streams(bag: Bag) -> dict[str, TopicData]:
@@ -346,9 +372,9 @@ def _empty_streams(bag: Bag) -> dict[str, TopicData]:
     return streams
 
 
-def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> dict[str, Counter[str]]:
-    """Read the messages of a bag into streams and transforms, in place; return how many sentences of a topic are not read."""
-    unread: dict[str, Counter[str]] = {}
+def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> Sentences:
+    """Read the messages of a bag into streams and transforms, in place; return what NMEA tells beside these."""
+    sentences = Sentences()
     mixed = {t.topic for t in bag.topics.values() if len(t.msgtypes) == 1 and t.msgtypes[0] in NMEA}
     wanted = set(streams) | mixed | ({TF_STATIC, TF_MOVING} & set(bag.topics))
     for raw in bag.messages(wanted) if wanted else ():
@@ -360,14 +386,20 @@ def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> dict[str
             msg = bag.decode(raw)
             said = _sentences(raw.topic, msg, streams) if raw.topic in mixed else _plain(raw, msg, streams)
             if raw.topic in mixed:
-                unread.setdefault(raw.topic, Counter()).update(nmea.unread(nmea.text_of(msg)))
+                sentences.unread.setdefault(raw.topic, Counter()).update(nmea.unread(nmea.text_of(msg)))
         except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything; counted
             said = [(streams[raw.topic], None)] if raw.topic in streams else []
         if raw.topic == TF_STATIC:
             tree.take(raw.msgtype, msg)
         for stream, row in said:
             _add(stream, row, raw, msg)
-    return unread
+            if raw.topic in mixed and stream.msgtype == NAV_SAT_FIX and row is not None and np.isfinite(row[:2]).all():
+                at_s = (stamp_ns_of(msg, raw.msgtype, raw.log_ns) or raw.log_ns) * 1e-9
+                after_s = at_s - nmea.time_of_day_s(nmea.text_of(msg), stream.topic.partition(" ")[2])
+                if np.isfinite(after_s):
+                    within = (after_s + _DAY_S / 2.0) % _DAY_S - _DAY_S / 2.0
+                    sentences.after_s.setdefault(stream.topic, []).append(within)
+    return sentences
 
 
 def _add(stream: TopicData, row: Row | None, raw: RawMessage, msg: Any) -> None:

@@ -66,7 +66,7 @@ from graphloc.frontends._reports import (
     filtered,
 )
 from graphloc.frontends._source import Bag, TopicSummary
-from graphloc.frontends._streams import TopicData, read_streams
+from graphloc.frontends._streams import Sentences, TopicData, read_streams
 from graphloc.frontends._tf import WORLD_NAMES, Pose, StaticTree
 from graphloc.frontends._time_offsets import MotionOffset, heading_time_offset, later_than, motion_time_offset
 from graphloc.frontends._turning import Turning
@@ -143,7 +143,7 @@ class _Contents:
     Attributes:
         source: its name, for messages. topics: by name, from its index.
         streams: by topic, as recorded. aligned: those with messages, on one clock.
-        tree: of tf. unread: how many sentences of NMEA no sensor reads, by topic and name. lidars, cameras, infos (their CameraInfos): by topic.
+        tree: of tf. sentences: what NMEA tells beside the streams. lidars, cameras, infos (their CameraInfos): by topic.
     """
 
     source: str
@@ -151,7 +151,7 @@ class _Contents:
     streams: Mapping[str, TopicData]
     aligned: Mapping[str, TopicData]
     tree: StaticTree
-    unread: Mapping[str, Counter[str]]
+    sentences: Sentences
     lidars: Mapping[str, _First]
     cameras: Mapping[str, _First]
     infos: Mapping[str, _First]
@@ -254,7 +254,7 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
     with Bag(paths) as bag:
         topics = bag.topics
         bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
-        streams, tree, unread = read_streams(bag)
+        streams, tree, sentences = read_streams(bag)
         lidars = _firsts_of(bag, [t.topic for t in topics.values() if set(CLOUDS) & set(t.msgtypes) and t.messages])
         cameras = _firsts_of(bag, _pictures(bag))
         infos = _firsts_of(
@@ -274,7 +274,7 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
     return _Contents(
         source=source, topics=topics, streams={s.topic: s for s in streams},
         aligned={s.topic: s for s in on_one_clock([_as_mostly_set(s, steps) for s in streams if len(s)])},
-        tree=tree, unread=unread, lidars=lidars, cameras=cameras, infos=infos, warnings=warnings,
+        tree=tree, sentences=sentences, lidars=lidars, cameras=cameras, infos=infos, warnings=warnings,
     )  # fmt: skip
 
 
@@ -288,11 +288,16 @@ def _topic_reports(bag: _Contents) -> tuple[TopicReport, ...]:
             topic=t.topic,
             msgtype=" or ".join(t.msgtypes),
             count=t.messages,
-            unread=dict(bag.unread.get(t.topic, Counter()).most_common()),
+            unread=dict(bag.sentences.unread.get(t.topic, Counter()).most_common()),
         )
         for t in bag.topics.values()
     ]
-    return (*topics, *(topic_report(s, len(s)) for name, s in streams.items() if name not in bag.topics))
+    sentences = (
+        replace(topic_report(s, len(s)), after_s=bag.sentences.spread_s(name))
+        for name, s in streams.items()
+        if name not in bag.topics
+    )
+    return (*topics, *sentences)
 
 
 def _gnss_reports(bag: _Contents) -> list[GnssReport]:

@@ -23,6 +23,7 @@ SPEEDS = ("VHW", "VBW")
 _SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # tag blocks before it are left out
 _FOREIGN = re.compile(r"!|\$P")
 _NAMED = re.compile(r"[$!]([A-Z][A-Z0-9]{2,9}),([^\r\n$!]*)")  # a sentence of any kind, with a checksum or without
+_CLOCK = re.compile(r"([0-2]\d)([0-5]\d)([0-6]\d(?:\.\d{0,9})?)")
 _SEALED = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")
 _UNREADABLE = (
     exceptions.NMEAParseError, exceptions.NMEAMessageError, exceptions.NMEATypeError, exceptions.NMEAStreamError,
@@ -68,6 +69,15 @@ def unread(text: str) -> list[str]:
         elif not _SEALED.search(found[2]):
             names.append(f"{name} without a checksum")
     return names
+
+
+def time_of_day_s(text: str, sentence: str) -> float:
+    """Return the UTC time of day at which a place ('GPGGA') was measured, s; NaN where it is not told."""
+    said = next((f[0] for f in _SENTENCE.finditer(text) if f[1] + f[2] == sentence), "")
+    fields = said.partition("*")[0].split(",")
+    place = 5 if sentence.endswith("GLL") else 1
+    clock = _CLOCK.fullmatch(fields[place]) if len(fields) > place else None
+    return nan if clock is None else 3600.0 * int(clock[1]) + 60.0 * int(clock[2]) + float(clock[3])
 
 
 def fix(text: str, wanted: Collection[str]) -> Fix | Rejection:

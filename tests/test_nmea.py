@@ -717,3 +717,47 @@ def test_a_ships_log_is_drafted_over_ground_and_through_the_water(
     read = read_recording(tmp_path / "run", load_config(tmp_path / "vessel.yaml", KINDS)).of(BodyVelocity)
     fixes = len(run.recording.of(GnssPosition))
     assert len(read) == fixes * len(logs)
+
+
+def test_a_time_of_day_is_that_of_the_place() -> None:
+    burst = (
+        sealed("GPZDA,1,2,3")
+        + sealed("GNRMC,235959.50,A,3722.4,N,12258.8,W,10.0,270.0,230324,,,A")
+        + sealed("GPGLL,3722.4,N,12258.8,W,000001,A")
+    )
+    assert nmea.time_of_day_s(burst, "GNRMC") == pytest.approx(86_399.5)
+    assert nmea.time_of_day_s(burst, "GPGLL") == pytest.approx(1.0)
+    assert isnan(nmea.time_of_day_s(sealed("GPGGA,,,,,,0"), "GPGGA"))
+    assert isnan(nmea.time_of_day_s(burst, "GPGGA"))
+
+
+@pytest.mark.parametrize(
+    ("clock_s", "uneven_s", "offset_s"),
+    [(0.0, 0.1, -0.4), (3.0, 0.1, 0.0), (-0.6, 0.1, 0.0), (0.0, 1.0, 0.0)],
+    ids=["on time", "clock ahead", "clock behind", "whole seconds"],
+)
+def test_the_time_in_its_sentences_tells_how_late_a_receiver_is_stamped(
+    clock_s: float, uneven_s: float, offset_s: float, tmp_path: Path
+) -> None:
+    """A boat's gateway passed its fixes on 0.4 to 0.6 s late, straight ahead, where the IMU tells nothing of it: 2 m at 3.5 m/s."""
+    make, rng = Messages(2), np.random.default_rng(3)
+    make.register(OTHER_TYPES[SENTENCE], SENTENCE)
+    items: list[Item] = [
+        ("/imu", START_NS + k * S // 50, make.imu(START_NS + k * S // 50, rng.normal((0.0, 0.0, 9.81), 0.05).tolist(), rng.normal(0.0, 0.002, 3).tolist()))
+        for k in range(3000)
+    ]  # fmt: skip
+    for k in range(60):
+        at_s = (START_NS // S) % 86_400 + k
+        clock = f"{at_s // 3600:02d}{at_s // 60 % 60:02d}{at_s % 60:02d}.00"
+        place = f"{minutes(57.7 + k * 3.5 / 111_400.0, 'NS', 2)},{minutes(11.9, 'EW', 3)}"
+        late_s = 0.4 + clock_s + uneven_s * (rng.random() - 0.5)
+        stamp_ns = START_NS + k * S + round(late_s * 1e9)
+        for body in (f"GPGGA,{clock},{place},1,09,0.9,5.0,M,40.0,M,,", "GPVTG,0.0,T,,M,6.80,N,12.6,K,A"):
+            items.append(
+                ("/nmea", stamp_ns, make.t[SENTENCE](header=make.header(stamp_ns, "gps"), sentence=sealed(body)))
+            )
+    _, config, text = look(tmp_path, sorted(items, key=lambda i: i[1]), make)
+    for kind in ("gnss", "gnss_velocity"):
+        (sensor,) = config.of_kind(kind).values()
+        assert sensor.time_offset_s == pytest.approx(offset_s, abs=0.03)
+    assert ("right if the computer's clock is" in text) == (offset_s != 0.0)
