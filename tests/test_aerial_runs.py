@@ -257,6 +257,42 @@ def test_where_windows_were_too_small_scans_are_matched_around_the_second_track(
     ]  # the second track has the first matches
 
 
+@pytest.mark.parametrize(
+    ("beyond", "grown"),
+    [
+        ((6, 3, 0), [4, 8]),  # until all are within reach
+        ((6, 3, 3), [4, 8]),  # or nothing is gained
+        ((6, 6), [4]),
+        ((0,), []),
+    ],
+)
+def test_a_track_without_gnss_is_grown_from_matches_within_reach(
+    beyond: tuple[int, ...], grown: list[int], bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """80 s without GNSS among fingers 10 m apart, offline: 20 m off, as of far scans only the next finger was in the window; online 0.4 m."""
+    recording, vessel = loaded(bag)
+    alone = vessel.sensors["aerial"].model_copy(update={"submap_s": 0.0})
+    vessel = vessel.model_copy(update={"sensors": vessel.sensors | {"aerial": alone}})
+    assert recording.imu is not None
+    until_ns = int(recording.imu.stamps_ns[0]) + 5 * S
+    imu = recording.imu.where(recording.imu.stamps_ns < until_ns)
+    fixes = tuple(m for m in recording.measurements if m.sensor == "gnss" and m.stamp_ns < until_ns)
+    short, rounds, around = replace(recording, measurements=fixes, imu=imu), iter(beyond), list[Solution]()
+
+    def faked(given: Recording, _config: VesselConfig, _datum: Datum, solution: Solution, *_: object) -> Matches:
+        around.append(solution)
+        found, left = fixes[: 9 + len(around)], next(rounds, 0)
+        return Matches(
+            replace(given, measurements=found), left > 0, [], (), frozenset(m.seq for m in found[len(found) - left :])
+        )
+
+    monkeypatch.setattr(_estimate, "with_matches", faked)
+    monkeypatch.setattr(_estimate, "_matches_used", lambda *_: 5)
+    app.smooth_recording(short, vessel, scans=app.Scans((bag / "run",), bag))
+    used = [len([row for row in s.ledger if row.sensor == "gnss"]) for s in around]
+    assert used[: 1 + len(grown)] == [len(fixes), *grown]
+
+
 def test_scans_are_laid_together(bag: Path) -> None:
     """Five scans of a moving vessel, or one and those of the seconds before, show more places than one, and at the same pose."""
     one, *several = (

@@ -90,8 +90,26 @@ def test_all_choices_are_weighed_whichever_is_in_the_graph(held: tuple[int, ...]
         assert np.exp(c.log) == pytest.approx(probability(right, news) / total, rel=1e-6)
         assert c.step[0] == pytest.approx(after(right)[0][place] - mean[place], abs=1e-9)
         assert c.cov[0, 0] == pytest.approx(after(right)[1][place, place], abs=1e-9)
+        assert not c.unplaced
     assert len(found) == len(ways)
     assert found[0].log == max(c.log for c in found)
+
+
+@pytest.mark.parametrize("off_m", [-0.05, 0.05])
+def test_what_is_known_by_one_measurement_alone_is_not_thrown_elsewhere_by_its_removal(off_m: float) -> None:
+    """Known to 20 m without it: that its factor was linearised 5 cm aside moved the mean of all choices by metres, for a second.
+
+    After an outage, or at a start beside a quay, the estimate was said 7 m off, and lost.
+    """
+    var = 1.0 / (1.0 / 20.0**2 + 1.0 / SIGMA_M**2)
+    found = Residual(
+        raw=np.array([off_m]), cov=np.eye(1) * SIGMA_M**2, jacobian=lambda: np.eye(1), prior=1.0 - FALSE, size_m=None, size_deg=None
+    )  # fmt: skip
+    weighed = choices(stream(), [0], [(found,)], np.full((2, 2), var), [(0, 1.0)])
+    (without,) = (c for c in weighed if c.modes == (None,))
+    assert abs(without.step[0]) < 1.0
+    assert without.unplaced
+    assert without.cov[0, 0] > (5.0 * SIGMA_M) ** 2  # so that it is known badly, which counts by its probability
 
 
 def test_two_false_ones_that_agree_are_within_the_bounds_and_given_up_when_a_right_one_comes() -> None:

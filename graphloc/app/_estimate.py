@@ -35,6 +35,8 @@ from graphloc.solution import Solution
 from graphloc.solve import smooth
 from graphloc.time import NS_PER_S
 
+_MOST_GROWN = 8  # times that scans are matched around what those within reach lead to: each carries it on for some 20 s
+_GAINS = 0.9  # of those beyond reach, that may be left for it to be worth its time
 _FEWEST_MATCHES = 5  # used, without which a track is no better to match around than the one before
 
 
@@ -115,6 +117,9 @@ def _matched(
 ) -> tuple[Recording, Solution, Gallery]:
     """Match scans around a solution without matches, and solve with them; once more where that leaves much open, if some are used.
 
+    Where it leaves more open than windows hold (GNSS is gone), the right place may lie outside, and among fingers and boats another one
+    looks like it. So it is grown there: solved with the matches within reach, scans are matched around that, and so on.
+
     Scans that are matched together with others are once more matched in any case, alone at first: others are placed by the track, and so
     they inherit the bends of one without matches.
 
@@ -124,16 +129,30 @@ def _matched(
     gallery = Gallery()
     single = _matched_alone(config)
     first = with_matches(recording, single, datum, alone, scans, progress, gallery)
-    solution = solve(first.recording, config, datum, probe=calibrate.PROBE, progress=progress)
     found = first
-    some_used = sum(map(solution.ledger.used, config.of_kind("aerial"))) >= _FEWEST_MATCHES
-    if single is not config or (first.cut_off and some_used):
+    for _ in range(_MOST_GROWN if found.cut_off and found.beyond else 0):
+        grown = solve(found.within_reach, config, datum, progress=progress)
+        if _matches_used(grown, config) < _FEWEST_MATCHES:
+            break
+        another = Gallery()
+        again = with_matches(recording, single, datum, grown, scans, progress, another)
+        if len(again.beyond) > _GAINS * len(found.beyond):
+            break
+        found, gallery = again, another
+        if not found.beyond:
+            break
+    solution = solve(found.recording, config, datum, probe=calibrate.PROBE, progress=progress)
+    if single is not config or (found.cut_off and _matches_used(solution, config) >= _FEWEST_MATCHES):
         gallery = Gallery()
         found = with_matches(recording, config, datum, solution, scans, progress, gallery)
         solution = solve(found.recording, config, datum, probe=calibrate.PROBE, progress=progress)
     warnings = (*found.recording.warnings, *first.turned, *first.late)
     doubts = (*found.recording.clock_doubts, *first.late)
     return replace(found.recording, warnings=warnings, clock_doubts=doubts), solution, gallery
+
+
+def _matches_used(solution: Solution, config: VesselConfig) -> int:
+    return sum(map(solution.ledger.used, config.of_kind("aerial")))
 
 
 def _matched_alone(config: VesselConfig) -> VesselConfig:

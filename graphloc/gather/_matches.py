@@ -52,12 +52,21 @@ class Matches(NamedTuple):
     Attributes:
         cut_off: many of the windows were too small for what the solution left open. turned: what is said of headings (`turned_heading`).
         late: what is said of stamps by how headings turn (`late_turns`).
+        beyond: `seq` of the matches whose windows were.
     """
 
     recording: Recording
     cut_off: bool
     turned: list[str]
     late: Sequence[str] = ()
+    beyond: frozenset[int] = frozenset()
+
+    @property
+    def within_reach(self) -> Recording:
+        """The recording without the matches whose windows were too small: there the right place may lie outside."""
+        return replace(
+            self.recording, measurements=tuple(m for m in self.recording.measurements if m.seq not in self.beyond)
+        )
 
 
 def with_matches(
@@ -76,7 +85,7 @@ def with_matches(
     """
     gathered, track = Gathering(recording), solution.trajectory
     span_s = int((track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9)
-    tried, cut_off, turned, late = 0, 0, list[str](), list[str]()
+    tried, cut_off, turned, late, beyond = 0, 0, list[str](), list[str](), set[int]()
     for name, sensor in config.of_kind("aerial").items():
         gathered.sensor(name, dict.fromkeys((lidar.topic for lidar in sensor.lidars.values()), f"read by {name}"))
         around = _when_scanned(track, solution.time_offsets_s.get(name, 0.0))
@@ -93,7 +102,8 @@ def with_matches(
                 if item.match.of_heading > _SURE:
                     turns.append((float(wrap_angle(best.pose[2] - prior.pose[2])), float(prior.sigma[2])))
                     turned_ns.append(item.stamp_ns)
-                gathered.take(item.match.fix(item.stamp_ns, name, item.since, sensor.axes))
+                taken = gathered.take(item.match.fix(item.stamp_ns, name, item.since, sensor.axes))
+                beyond |= {taken.seq} if item.match.cut_off else set()
             else:
                 gathered.refuse(name, item.stamp_ns, item.why_not)
             progress("matching", min(int((item.stamp_ns - track.stamps_ns[0]) / 1e9), span_s), span_s)
@@ -103,7 +113,7 @@ def with_matches(
         late += late_turns(
             name, sensor, around, np.array(turned_ns, dtype=np.int64), np.array([turn for turn, _ in turns])
         )
-    return Matches(gathered.recording(), cut_off > _CUT_OFF * tried, turned, late)
+    return Matches(gathered.recording(), cut_off > _CUT_OFF * tried, turned, late, frozenset(beyond))
 
 
 def _when_scanned(track: Trajectory, late_s: float) -> Trajectory:

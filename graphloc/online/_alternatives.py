@@ -26,6 +26,8 @@ _MOST, _LEAST = 16, 12.0  # choices that are kept; log probability (nats) below 
 # Least eigenvalue of what remains when a measurement is removed, as a share of its own information. Its factor was linearised
 # a moment ago at another pose, so the difference may come out negative by a hundredth or so.
 _LOOSEST = 1e-3
+# Below this one it tells how loose the rest leaves that direction, and not where: a residual of 3 cm would move the estimate by 30 m.
+_TELLS = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,13 +37,14 @@ class Choice:
     Attributes:
         log: log of its probability. modes: of N measurements, the mode that is right; None: the measurement is false.
         step: (d,) from the present estimate to that of this choice: position first (m, world), then each residual.
-        cov: (d, d), its covariance.
+        cov: (d, d), its covariance. unplaced: whether along some direction it is known only by that how far off its mean may be.
     """
 
     log: float
     modes: tuple[int | None, ...]
     step: Array
     cov: Array
+    unplaced: bool = False
 
 
 def choices(
@@ -61,7 +64,8 @@ def choices(
     _, models = taken_of(stream, indices)
     ends = np.cumsum([0, *(len(found[0].raw) for found in residuals)])
     at = [slice(a, b) for a, b in pairwise(ends + len(cov) - ends[-1])]
-    found = [Choice(0.0, (), *_without(residuals, cov, held, at))]
+    step, loose, unplaced = _without(residuals, cov, held, at)
+    found = [Choice(0.0, (), step, loose, unplaced)]
     for n, model in enumerate(models):
         repeats = model.repeats if n else 0.0
         grown = []
@@ -72,7 +76,7 @@ def choices(
                 step, cov = c.step - gain @ r.raw, c.cov - gain @ c.cov[at[n]]
                 nis = r.nis(P)  # in full: it says whether they agree, not how well the modes look
                 log_right = model.news * (r.log_density(P) + 0.5 * nis) - 0.5 * nis
-                grown.append(Choice(c.log + log_right, (*c.modes, mode), step, cov))
+                grown.append(Choice(c.log + log_right, (*c.modes, mode), step, cov, unplaced))
             log = log_right_and_false(seen, P, model)[1]
             if n and c.modes[-1] is None and repeats > 0.0 and len(seen[0].raw) == len(residuals[n - 1][0].raw):
                 before = tuple(replace(r, raw=r.raw + c.step[at[n - 1]]) for r in residuals[n - 1])
@@ -80,7 +84,7 @@ def choices(
                 walked = P + c.cov[at[n - 1], at[n - 1]] - cross - cross.T
                 again = log_false_again(model, before, seen, walked)
                 log = float(np.logaddexp(np.log1p(-repeats) + log, again))
-            grown.append(Choice(c.log + model.news * log, (*c.modes, None), c.step, c.cov))
+            grown.append(Choice(c.log + model.news * log, (*c.modes, None), c.step, c.cov, unplaced))
         grown.sort(key=lambda c: -c.log)
         found = [c for c in grown[:_MOST] if c.log > grown[0].log - _LEAST]
     total = float(np.logaddexp.reduce([c.log for c in found]))
@@ -89,17 +93,21 @@ def choices(
 
 def _without(
     residuals: Sequence[tuple[Residual, ...]], cov: Array, held: Sequence[tuple[int, float] | None], at: list[slice]
-) -> tuple[Array, Array]:
-    """Return step and covariance, as in `Choice`, after removing all of the measurements from the graph."""
+) -> tuple[Array, Array, bool]:
+    """Return step, covariance, and whether it is unplaced, as in `Choice`, after removing all of the measurements from the graph."""
     there = [(n, *h) for n, h in enumerate(held) if h is not None]
     if not there:
-        return np.zeros(len(cov)), cov
+        return np.zeros(len(cov)), cov, False
     rows = np.concatenate([np.arange(len(cov))[at[n]] for n, _, _ in there])
     raw = np.concatenate([residuals[n][mode].raw for n, mode, _ in there])
     root = block_diag(*(np.linalg.cholesky(residuals[n][mode].cov / weight) for n, mode, weight in there))
     # Inverse of the innovation covariance of the removal.
     inverse = np.linalg.inv(root)
     values, vectors = np.linalg.eigh(np.eye(len(rows)) - inverse @ cov[np.ix_(rows, rows)] @ inverse.T)
-    left = inverse.T @ vectors / np.maximum(values, _LOOSEST) @ vectors.T @ inverse
-    gain = cov[:, rows] @ left
-    return gain @ raw, cov + gain @ cov[rows]
+    looser, there_m = (
+        1.0 / np.maximum(values, _LOOSEST),
+        np.where(values > _TELLS, 1.0 / np.maximum(values, _TELLS), 0.0),
+    )
+    by_root = cov[:, rows] @ inverse.T @ vectors
+    step = by_root * there_m @ (vectors.T @ inverse @ raw)
+    return step, cov + by_root * looser @ by_root.T, bool((values <= _TELLS).any())

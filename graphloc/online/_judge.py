@@ -280,6 +280,9 @@ class Judge:
             tells = np.array([np.trace(c.cov[:3, :3]) for c in weighed]) < _LOOSE * np.trace(cov[:3, :3])
             mean = (share * tells) @ steps if best == now else np.zeros(3)
             around = (share[:, None] * (steps - mean)).T @ (steps - mean)
+            around += sum(
+                (p * _more(c.cov, cov) for p, c in zip(share, weighed, strict=True) if c.unplaced), np.zeros((3, 3))
+            )
             if np.trace(around) > _SHOWS * np.trace(cov[:3, :3]):
                 self._others[stream.name] = mean, around
             chosen = frozenset((e.index, mode) for e, mode in zip(own, best, strict=True))
@@ -317,3 +320,9 @@ class Judge:
         """Return minus the log probability of the window, marginalised over all hypotheses of a stream."""
         evidence = log_evidence_of(stream, [e.index for e in own], self._attach(own)[1])
         return self._window.error([e.held for e in own if e.held is not None]) - evidence
+
+
+def _more(cov: Array, than: Array) -> Array:
+    """Return by how much the covariance (3, 3) of the position in one joint covariance is larger than in another, along its own axes."""
+    size, axes = np.linalg.eigh(cov[:3, :3] - than[:3, :3])
+    return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
