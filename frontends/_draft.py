@@ -348,6 +348,8 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3)
         more = ", ".join([*([f"vertical_sigma_m: {vertical:.1f}"] if wanders else []), *large])
         fixed = f"; {{{_RTK_SLOW_ERROR}}} where RTK is fixed throughout" if gnss.rtk_sigma_m else ""
+        if gnss.reported_sigma_m and max(gnss.reported_sigma_m[:2]) < RTK_SIGMA_M:
+            fixed = f"; {{{_RTK_SLOW_ERROR}}} if RTK makes them as good as they claim, which their status does not say"
         lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{said}{fixed}")
     return lines
 

@@ -264,6 +264,23 @@ def test_rtk_that_claims_nothing_is_drafted_as_it_scatters(
     assert gnss.slow_error == usual.slow_error
 
 
+@pytest.mark.parametrize(
+    ("status", "sigma_m", "said"), [(0, 0.02, True), (1, 0.02, True), (2, 0.02, False), (0, 0.5, False)]
+)
+def test_fixes_that_claim_centimetres_without_a_status_of_rtk_are_left_to_the_user(
+    status: int, sigma_m: float, said: bool, tmp_path: Path
+) -> None:
+    """Drivers claim them for nothing, or do not tell that it is RTK: beside an image 2 m off these give way, and nothing said so."""
+    items = fixes(5, noise_m=0.015, sigma_m=sigma_m)
+    for _, _, message in items:
+        message.status.status = status
+    read(tmp_path, items)
+    lines = draft_config(inspect_bag(tmp_path / "run")).splitlines()
+    (line,) = (line for line in lines if line.strip().startswith("slow_error:"))
+    assert ("if RTK makes them as good as they claim" in line) == said
+    assert line.strip().startswith("slow_error: {}") == (status < 2)
+
+
 @pytest.mark.parametrize(("hz", "sigma_m", "said"), [(10, 1e4, 1), (2, 1e4, 1), (10, 20.0, 0)])
 def test_fixes_that_claim_to_tell_nothing_are_reported(hz: int, sigma_m: float, said: int, tmp_path: Path) -> None:
     """A driver that writes 1e8 m^2: the track was 100 m off its fixes, and its bounds km, without a word."""
