@@ -668,6 +668,22 @@ def test_sentences_that_are_read_are_not_named_as_unread() -> None:
         sealed("GPRMC,122310.2,A,3722.425671,N,12258.856215,W,10.0,270.0,230324,,,A") + "\r\n" + sealed("HEHDT,1.0,T")
     )
     assert nmea.unread(burst + "\r\n" + sealed("GPGSA,A,3")) == ["GPGSA"]
+    assert nmea.unread(sealed("GPGGA,1") + "\0") == []  # as drivers end a string
+    assert nmea.unread(sealed("GPGGA,1") + " \\s:gps*33\\" + sealed("GPHDT,1,T")) == []  # a tag block between
+
+
+def test_a_heading_of_pashr_is_found_among_what_the_device_says_otherwise(tmp_path: Path) -> None:
+    """Its satellites came as often as its heading, so that it was no compass; and first in a message, they hid the heading."""
+    satellites, turned = "PASHR,SAT,3,2,1,1,1", "PASHR,ATT,220712.0,{:.1f},1.0,2.0,0.002,0.003,0"
+    burst = f"{sealed(satellites)}\r\n{sealed(turned.format(123.4))}"
+    assert nmea.heading_deg(burst, ("PASHR",)) == pytest.approx(123.4)
+    bag, drafted = rmc_bag(tmp_path / "run", lambda _, deg: [satellites, turned.format(deg)]), tmp_path / "vessel.yaml"
+    found = inspect_bag(bag)
+    drafted.write_text(draft_config(found))
+    config = load_config(drafted, KINDS)
+    assert [sensor.nmea for sensor in config.of_kind("compass").values()] == [("PASHR",)]
+    assert "PASHR,SAT (200)" in render(found)
+    assert len(read_recording(bag, config).of(CompassHeading)) == 200
 
 
 @pytest.mark.parametrize(
