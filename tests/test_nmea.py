@@ -23,7 +23,7 @@ from graphloc.config import (
     load_config,
     parse_config,
 )
-from graphloc.errors import ConfigError
+from graphloc.errors import ConfigError, InputError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
 from graphloc.frontends import nmea
@@ -287,8 +287,9 @@ def rmc_bag(path: Path, more: Callable[[float, float], list[str]], speeds: bool 
         (lambda kn, deg: [f"GPVTG,{deg:.1f},T,,M,{kn:.3f},N,{kn * 1.852:.3f},K,A"], True, ("GPVTG",)),
         (lambda kn, deg: [f"GNVTG,{deg:.1f},T,,M,{kn:.3f},N,{kn * 1.852:.3f},K,A"], True, ("GNVTG",)),
         (lambda *_: ["GPVTG,,T,,M,,N,,K"], True, ("GPRMC",)),
+        (lambda kn, deg: [f"GPVTG,{deg:.1f},T,,M,{kn:.3f},N,,K,A"] if deg % 6.0 else [], True, ("GPRMC",)),
     ],
-    ids=["RMC", "without a speed", "VTG", "VTG of another talker", "empty VTG"],
+    ids=["RMC", "without a speed", "VTG", "VTG of another talker", "empty VTG", "VTG every other time"],
 )
 def test_course_and_speed_of_rmc_are_drafted_where_no_vtg_says_them(
     more: Callable[[float, float], list[str]], speeds: bool, read: tuple[str, ...] | None, tmp_path: Path
@@ -702,6 +703,19 @@ def test_a_speed_that_a_log_calls_invalid_is_none() -> None:
     said = nmea.log_velocity_mps(sealed("VDVBW,4.0,0.0,A,0.0,0.0,V"), nmea.SPEEDS, "ground")
     assert isinstance(said, Rejection)
     assert (said.outcome, said.reason) == (Outcome.REJECTED, "VBW: its speed over ground is not valid")
+
+
+@pytest.mark.parametrize(("nmea_of_ground", "both"), [(("VBW",), True), (("VHW",), False), (("VHW", "VBW"), False)])
+def test_of_one_line_only_vbw_is_read_over_ground_and_through_the_water(
+    nmea_of_ground: tuple[str, ...], both: bool, bag: Path
+) -> None:
+    """It tells both; VHW would count twice."""
+    ground = BodyVelocityConfig(topic="/nmea_sentence", nmea=nmea_of_ground)
+    water = BodyVelocityConfig(topic="/nmea_sentence", through="water", nmea=("VBW", "VHW"))
+    config = VesselConfig(sensors={"ground": ground, "water": water})
+    refused = pytest.raises(InputError, match=r"sensors\.water and sensors\.ground read /nmea_sentence over ground and")
+    with nullcontext() if both else refused:
+        read_recording(bag, config)
 
 
 @pytest.mark.parametrize("tracks_bottom", [True, False])

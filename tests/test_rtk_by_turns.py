@@ -115,7 +115,8 @@ def test_poses_are_good_again_once_rtk_is_back_after_a_jump_of_the_other_fixes(
     )
     solution, off_m, t = solved(two, solve)
     good = np.array([health is Health.GOOD for health in solution.health])
-    assert not good[(t > 40.0) & (t < 44.0)].any()  # beside matches, the receiver agrees only by an error it hardly has
+    assert not good[(t > 38.0) & (t < 44.0)].any()  # beside matches, the receiver agrees only by an error it hardly has
+    assert solution.since_agreed_s["gnss_other"][(t > 42.0) & (t < 44.0)].min() > 8.0
     assert good[t > 57.0].all()
     assert off_m[t > 57.0].max() < 0.3
 
