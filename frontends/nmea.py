@@ -24,7 +24,8 @@ _SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # t
 _FOREIGN = re.compile(r"!|\$P")
 _NAMED = re.compile(r"[$!]([A-Z][A-Z0-9]{2,9}),([^\r\n$!]*)")  # a sentence of any kind, with a checksum or without
 _CLOCK = re.compile(r"([0-2]\d)([0-5]\d)([0-6]\d(?:\.\d{0,9})?)")
-_SEALED = re.compile(r"\*[0-9A-Fa-f]{2}\s*$")
+_SEALED = re.compile(r"\*[0-9A-Fa-f]{2}")
+_NO_HEADING = re.compile(r"PASHR,(?!ATT,)([A-Z]\w*)")  # the same device's satellites, positions and the like
 _UNREADABLE = (
     exceptions.NMEAParseError, exceptions.NMEAMessageError, exceptions.NMEATypeError, exceptions.NMEAStreamError,
     ValueError, TypeError, KeyError, IndexError, AttributeError,
@@ -56,16 +57,19 @@ def text_of(msg: Any) -> str:
 
 def identities(text: str) -> list[tuple[str, str]]:
     """Return talker and sentence ('GP', 'GGA') of each distinct sentence; some drivers put a whole burst into a message."""
-    return list(dict.fromkeys((found[1], found[2]) for found in _SENTENCE.finditer(text)))
+    telling = (found for found in _SENTENCE.finditer(text) if not _NO_HEADING.match(found[0], 1))
+    return list(dict.fromkeys((found[1], found[2]) for found in telling))
 
 
 def unread(text: str) -> list[str]:
-    """Return the names of the sentences of which no sensor reads anything ('GPGSV', 'PSAT', 'AIVDM'), and why of those it would read."""
+    """Return the names of the sentences of which no sensor reads anything ('GPGSV', 'PSAT', 'AIVDM', 'PASHR,SAT'), and why of those it would read."""
     names = []
     for found in _NAMED.finditer(text):
         name = found[1]
         if name[2:] not in (*PLACES, *HEADINGS, *VELOCITIES, *SPEEDS):
             names.append(name)
+        elif other := _NO_HEADING.match(found[0], 1):
+            names.append(f"{name},{other[1]}")
         elif not _SEALED.search(found[2]):
             names.append(f"{name} without a checksum")
     return names
@@ -120,7 +124,7 @@ def heading_deg(text: str, wanted: Collection[str]) -> float | Rejection:
     value = _number(said, _HEADING_FIELDS[said.msgID])
     if said.msgID == "HDG":
         value += _east(said, "deviation") + _east(said, "variation")
-    return value if isfinite(value) else rejected(f"{said.msgID}: no heading")
+    return value if isfinite(value) else rejected(f"{'PASHR' if said.msgID == 'ASHR' else said.msgID}: no heading")
 
 
 def velocity_mps(text: str, wanted: Collection[str]) -> tuple[float, float] | Rejection:
@@ -163,7 +167,8 @@ def _read(text: str, wanted: Collection[str], kinds: Collection[str], what: str)
         return ignored(f"{foreign[0]}...: AIS or a maker's own sentence: not read")
     if not sentences:
         return malformed(f"no sentence of NMEA 0183 with a checksum: {text.strip()[:20]!r}")
-    found = next((f for f in sentences if f[2] in wanted or f[1] + f[2] in wanted), sentences[0])
+    fitting = [f for f in sentences if f[2] in wanted or f[1] + f[2] in wanted] or sentences[:1]
+    found = next((f for f in fitting if not _NO_HEADING.match(f[0], 1)), fitting[0])
     talker, kind = found[1], found[2]
     if kind not in wanted and talker + kind not in wanted:
         return ignored(f"{kind}: not among the sentences that are read ({', '.join(wanted)})")

@@ -23,7 +23,7 @@ from graphloc.config import (
     load_config,
     parse_config,
 )
-from graphloc.errors import ConfigError
+from graphloc.errors import ConfigError, InputError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
 from graphloc.frontends import nmea
@@ -287,8 +287,9 @@ def rmc_bag(path: Path, more: Callable[[float, float], list[str]], speeds: bool 
         (lambda kn, deg: [f"GPVTG,{deg:.1f},T,,M,{kn:.3f},N,{kn * 1.852:.3f},K,A"], True, ("GPVTG",)),
         (lambda kn, deg: [f"GNVTG,{deg:.1f},T,,M,{kn:.3f},N,{kn * 1.852:.3f},K,A"], True, ("GNVTG",)),
         (lambda *_: ["GPVTG,,T,,M,,N,,K"], True, ("GPRMC",)),
+        (lambda kn, deg: [f"GPVTG,{deg:.1f},T,,M,{kn:.3f},N,,K,A"] if deg % 6.0 else [], True, ("GPRMC",)),
     ],
-    ids=["RMC", "without a speed", "VTG", "VTG of another talker", "empty VTG"],
+    ids=["RMC", "without a speed", "VTG", "VTG of another talker", "empty VTG", "VTG every other time"],
 )
 def test_course_and_speed_of_rmc_are_drafted_where_no_vtg_says_them(
     more: Callable[[float, float], list[str]], speeds: bool, read: tuple[str, ...] | None, tmp_path: Path
@@ -668,6 +669,22 @@ def test_sentences_that_are_read_are_not_named_as_unread() -> None:
         sealed("GPRMC,122310.2,A,3722.425671,N,12258.856215,W,10.0,270.0,230324,,,A") + "\r\n" + sealed("HEHDT,1.0,T")
     )
     assert nmea.unread(burst + "\r\n" + sealed("GPGSA,A,3")) == ["GPGSA"]
+    assert nmea.unread(sealed("GPGGA,1") + "\0") == []  # as drivers end a string
+    assert nmea.unread(sealed("GPGGA,1") + " \\s:gps*33\\" + sealed("GPHDT,1,T")) == []  # a tag block between
+
+
+def test_a_heading_of_pashr_is_found_among_what_the_device_says_otherwise(tmp_path: Path) -> None:
+    """Its satellites came as often as its heading, so that it was no compass; and first in a message, they hid the heading."""
+    satellites, turned = "PASHR,SAT,3,2,1,1,1", "PASHR,ATT,220712.0,{:.1f},1.0,2.0,0.002,0.003,0"
+    burst = f"{sealed(satellites)}\r\n{sealed(turned.format(123.4))}"
+    assert nmea.heading_deg(burst, ("PASHR",)) == pytest.approx(123.4)
+    bag, drafted = rmc_bag(tmp_path / "run", lambda _, deg: [satellites, turned.format(deg)]), tmp_path / "vessel.yaml"
+    found = inspect_bag(bag)
+    drafted.write_text(draft_config(found))
+    config = load_config(drafted, KINDS)
+    assert [sensor.nmea for sensor in config.of_kind("compass").values()] == [("PASHR",)]
+    assert "PASHR,SAT (200)" in render(found)
+    assert len(read_recording(bag, config).of(CompassHeading)) == 200
 
 
 @pytest.mark.parametrize(
@@ -686,6 +703,19 @@ def test_a_speed_that_a_log_calls_invalid_is_none() -> None:
     said = nmea.log_velocity_mps(sealed("VDVBW,4.0,0.0,A,0.0,0.0,V"), nmea.SPEEDS, "ground")
     assert isinstance(said, Rejection)
     assert (said.outcome, said.reason) == (Outcome.REJECTED, "VBW: its speed over ground is not valid")
+
+
+@pytest.mark.parametrize(("nmea_of_ground", "both"), [(("VBW",), True), (("VHW",), False), (("VHW", "VBW"), False)])
+def test_of_one_line_only_vbw_is_read_over_ground_and_through_the_water(
+    nmea_of_ground: tuple[str, ...], both: bool, bag: Path
+) -> None:
+    """It tells both; VHW would count twice."""
+    ground = BodyVelocityConfig(topic="/nmea_sentence", nmea=nmea_of_ground)
+    water = BodyVelocityConfig(topic="/nmea_sentence", through="water", nmea=("VBW", "VHW"))
+    config = VesselConfig(sensors={"ground": ground, "water": water})
+    refused = pytest.raises(InputError, match=r"sensors\.water and sensors\.ground read /nmea_sentence over ground and")
+    with nullcontext() if both else refused:
+        read_recording(bag, config)
 
 
 @pytest.mark.parametrize("tracks_bottom", [True, False])

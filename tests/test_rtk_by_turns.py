@@ -40,10 +40,10 @@ CENTIMETRES = SlowErrorConfig(horizontal_sigma_m=0.03, vertical_sigma_m=0.06)
 
 
 def receiver(
-    rtk: Callable[[float], bool], off_m: Callable[[float], tuple[float, float]]
+    rtk: Callable[[float], bool], off_m: Callable[[float], tuple[float, float]], track: Scenario = TRACK
 ) -> tuple[SimulatedRun, SimulatedRun]:
     """A run whose receiver has RTK at some times, s, and is so far off east and north: as one sensor, with the slow error of fixes without, and as two."""
-    run = simulate(TRACK, 3)
+    run = simulate(track, 3)
     truth, datum = run.truth, app.choose_datum(run.recording, run.config)
 
     def moved(m: Measurement, *, two: bool) -> Measurement:
@@ -102,6 +102,23 @@ def test_two_sensors_know_it_to_centimetres_where_there_is_rtk(
     assert np.mean(off_m < bounds_m[1]) > 0.95
     assert Cause.SENSORS not in {reason.cause for reason in two.health_reason}
     assert np.mean([health is Health.GOOD for health in two.health]) > 0.9
+
+
+@pytest.mark.parametrize("solve", [app.smooth_recording, app.replay_recording], ids=["offline", "online"])
+def test_poses_are_good_again_once_rtk_is_back_after_a_jump_of_the_other_fixes(
+    solve: Callable[[Recording, VesselConfig], app.Run],
+) -> None:
+    """The other fixes, the last of which were 15 m off, come no more: for the rest of the run they were held against each pose."""
+    with_matches = replace(TRACK, pose_hz=1.0, false_fraction=0.0, duration_s=80.0)
+    _, two = receiver(
+        lambda t: not 20.0 < t < 45.0, lambda t: (15.0, 0.0) if 30.0 < t < 45.0 else (0.0, 0.0), with_matches
+    )
+    solution, off_m, t = solved(two, solve)
+    good = np.array([health is Health.GOOD for health in solution.health])
+    assert not good[(t > 38.0) & (t < 44.0)].any()  # beside matches, the receiver agrees only by an error it hardly has
+    assert solution.since_agreed_s["gnss_other"][(t > 42.0) & (t < 44.0)].min() > 8.0
+    assert good[t > 57.0].all()
+    assert off_m[t > 57.0].max() < 0.3
 
 
 @pytest.mark.parametrize("solve", [app.smooth_recording, app.replay_recording], ids=["offline", "online"])

@@ -233,6 +233,14 @@ def test_a_survey_in_degrees_is_refused(tmp_path: Path, place: str) -> None:
         with_surveys(config, tmp_path)
 
 
+def test_a_tag_at_the_origin_of_a_simulator_is_not_taken_for_one_in_degrees(tmp_path: Path) -> None:
+    """Its datum is 0, 0."""
+    written(tmp_path, entry(xyz_m="[0.0, 0.0, 1.0]"))
+    config = VesselConfig.model_validate({"sensors": {}, "datum": dict.fromkeys(UTM_33, 0.0)})
+    config = config.model_copy(update={"sensors": {"tags": AprilTagConfig(survey="tags.yaml")}})
+    assert len(with_surveys(config, tmp_path).sensors["tags"].surveyed.tags) == 1
+
+
 def test_a_sensor_without_a_survey_says_what_it_needs(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"sensors\.bow\.survey: name the tags\.yaml"):
         with_surveys(vessel(bow=AprilTagConfig()), tmp_path)

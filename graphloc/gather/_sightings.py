@@ -60,7 +60,8 @@ def _in_world(survey: Survey, config: VesselConfig, path: Path) -> Survey:
 def _in_degrees(survey: Survey, datum: Geodetic) -> TagConfig | None:
     """Return a tag of world whose place is given as the datum's latitude and longitude, to some km; None if there is none."""
     here = np.array([datum.latitude_deg, datum.longitude_deg])
-    for tag in () if survey.grid else survey.tags:
+    metres = survey.grid != "" or np.abs(here).max() < 1.0  # simulators have their origin at 0, 0: so may a tag
+    for tag in () if metres else survey.tags:
         place = np.array(tag.xyz_m[:2])
         if tag.frame == WORLD and min(np.abs(place - here).max(), np.abs(place - here[::-1]).max()) < _NEAR_DEG:
             return tag

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.special import expit
 
@@ -25,13 +27,14 @@ class Agreement:
 
     Attributes:
         agreed_ns: stamp of the last measurement that agreed, by sensor.
-        incredible: sensors whose last one agreed only by a slow error that is hardly possible.
     """
 
     def __init__(self, timeline: LiveTimeline) -> None:
         self._timeline = timeline
         self.agreed_ns: dict[str, int] = {}
-        self.incredible: set[str] = set()
+        self._newest: dict[
+            str, tuple[int, bool]
+        ] = {}  # that agreed, by sensor: stamp, and whether by a slow error that is hardly possible
         # Stamps of the first few absolute measurements that disagreed since the last that agreed.
         self._refused: list[int] = []
         self._denied: dict[str, int] = {}  # by sensor: how many in a row disagreed, whatever slow error is allowed
@@ -48,7 +51,8 @@ class Agreement:
         if verdict is not None and agrees:
             far = far_sigmas(stream.slow, verdict.at)
             self._note_level(m.stamp_ns, usual=far <= _USUAL)
-            (self.incredible.add if far > CREDIBLE else self.incredible.discard)(stream.name)
+            # Older ones are judged again after newer ones.
+            self._newest[stream.name] = max(self._newest.get(stream.name, (0, False)), (m.stamp_ns, far > CREDIBLE))
         if verdict is not None and agrees and _credible(stream, verdict.at):
             self.agreed_ns[stream.name] = max(m.stamp_ns, self.agreed_ns.get(stream.name, m.stamp_ns))
             self._refused = [stamp for stamp in self._refused if stamp > m.stamp_ns]
@@ -74,14 +78,26 @@ class Agreement:
         self._denied.clear()
         self._jumped_ns = None
 
+    def incredible(self, receiver_of: Callable[[str], str]) -> list[str]:
+        """Return the sensors whose newest measurement that agrees does so only by a slow error which is hardly possible.
+
+        Args:
+            receiver_of: the name of a sensor's receiver (`VesselConfig.receiver_of`): of those that read one by turns the newest counts.
+        """
+        newest: dict[str, tuple[int, bool, str]] = {}
+        for name, (stamp_ns, far) in self._newest.items():
+            receiver = receiver_of(name)
+            newest[receiver] = max(newest.get(receiver, (0, False, "")), (stamp_ns, far, name))
+        return sorted(name for _, far, name in newest.values() if far)
+
     def marked(self) -> _Mark:
         """Return the state, for `back_to`."""
         levels = self._usual_ns, self._jumped_ns, self._told_ns
-        return dict(self.agreed_ns), set(self.incredible), list(self._refused), dict(self._denied), *levels
+        return dict(self.agreed_ns), dict(self._newest), list(self._refused), dict(self._denied), *levels
 
     def back_to(self, mark: _Mark) -> None:
         """Forget what was noted since `marked`: it agreed with choices that were given up."""
-        self.agreed_ns, self.incredible, self._refused, self._denied = mark[:4]
+        self.agreed_ns, self._newest, self._refused, self._denied = mark[:4]
         self._usual_ns, self._jumped_ns, self._told_ns = mark[4:]
 
     def inherit(self, before: Agreement) -> None:
@@ -126,7 +142,9 @@ class Agreement:
         return jumped_s if jumped_s > float(np.clip(end - begin, *_JUMPED_S)) else 0.0
 
 
-_Mark = tuple[dict[str, int], set[str], list[int], dict[str, int], tuple[int, int] | None, int | None, int]
+_Mark = tuple[
+    dict[str, int], dict[str, tuple[int, bool]], list[int], dict[str, int], tuple[int, int] | None, int | None, int
+]
 
 
 def _credible(stream: LiveStream, at: Attachment) -> bool:

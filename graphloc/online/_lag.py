@@ -260,7 +260,7 @@ class Lag:
             for n, s in streams
             if s.slow is not None and s.slow.late is not None and TIME_OFFSET in s.receiver.far_off
         ]
-        incredible = sorted(self._agreement.incredible)
+        incredible = self._agreement.incredible(self.problem.config.receiver_of)
         return "; ".join([*map(why_in_doubt, doubtful), *map(why_late, late), *map(why_incredible, incredible)])
 
     @property

@@ -68,24 +68,37 @@ def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[st
             for at_ns in stream.position_jumps[0]:
                 for k in np.flatnonzero(np.abs(stamps_ns - at_ns) < LASTS_S * 1e9):
                     said[int(k)] = why_in_doubt(stream.name)
-        if not why and stream.row.absolute and stream.slow is not None:
-            for k in np.flatnonzero(_beside_incredible(problem, stream, result.verdicts)):
-                said[int(k)] = why_incredible(stream.name)
+    receivers: dict[str, list[Stream]] = {}
+    for stream in problem.streams if not why else ():
+        if stream.row.absolute:
+            receivers.setdefault(problem.config.receiver_of(stream.name), []).append(stream)
+    for by_turns in receivers.values():
+        names = _incredible(problem, by_turns, result.verdicts)
+        said = [why_incredible(name) if name else own for own, name in zip(said, names, strict=True)]
     return said
 
 
-def _beside_incredible(problem: Problem, stream: Stream, verdicts: dict[tuple[int, int], Verdict]) -> NDArray[np.bool_]:
-    """Return at which states (N,) the newest measurement of a sensor that agrees does so only by a slow error which is hardly possible.
+def _incredible(
+    problem: Problem, by_turns: Sequence[Stream], verdicts: dict[tuple[int, int], Verdict]
+) -> Sequence[str]:
+    """Return the sensor whose newest measurement that agrees does so only by a slow error which is hardly possible, at each state.
 
-    Before the first one, it is the one to come: a smoother knows it.
+    Before the first one, it is the one to come: a smoother knows it. Empty where there is none.
+
+    Args:
+        by_turns: those that read one receiver, or a single one.
     """
-    own = ((m.stamp_ns, verdicts[stream.number, i]) for i, m in enumerate(stream.measurements))
-    agrees = [(stamp_ns, far_sigmas(stream.slow, v.at) <= CREDIBLE) for stamp_ns, v in own if v.weight >= AGREES]
+    agrees = sorted(
+        (m.stamp_ns, stream.name if far_sigmas(stream.slow, verdict.at) > CREDIBLE else "")
+        for stream in by_turns
+        for i, m in enumerate(stream.measurements)
+        if (verdict := verdicts[stream.number, i]).weight >= AGREES
+    )
     stamps_ns = problem.timeline.stamps_ns
-    if not agrees:
-        return np.zeros(len(stamps_ns), dtype=bool)
-    at_ns, right = (np.array(column) for column in zip(*agrees, strict=True))
-    return np.asarray(~right[np.maximum(np.searchsorted(at_ns, stamps_ns, side="right") - 1, 0)])
+    if not any(name for _, name in agrees):
+        return [""] * len(stamps_ns)
+    newest = np.searchsorted(np.array([stamp_ns for stamp_ns, _ in agrees]), stamps_ns, side="right") - 1
+    return [agrees[k][1] for k in np.maximum(newest, 0)]
 
 
 def since_agreed(problem: Problem, stream: Stream, verdicts: dict[tuple[int, int], Verdict]) -> Array:
