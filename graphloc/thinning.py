@@ -3,24 +3,44 @@
 
 from __future__ import annotations
 
+from collections import deque
+
+from graphloc.time import NS_PER_S
+
 LEAST_APART_NS = 45_000_000
-"""Between two fixes, velocities or headings of a sensor that are used: 20 a second stay, though steps between their stamps are up to 5 ms short."""
+"""Between two fixes, velocities or headings of a fast sensor that are used: 20 a second stay, though steps between their stamps are up to 5 ms short."""
 THINNED = "less than 0.05 s after the one before: what it errs lasts longer, so that it tells nothing new"
+_RATE_OVER_NS = 2 * NS_PER_S
 
 
 class Thinning:
-    """Of one sensor's measurements, in order of arrival, those that follow the one before within less than `apart_ns` are too many.
+    """Of a sensor that is faster than one measurement per `apart_ns`, those that follow the one before within less are too many.
 
-    What is not in order of its stamps stays.
+    How fast it is shows in two seconds; until then it may be. What is not in order of its stamps stays. So do bursts of a slower
+    sensor, as through a gateway: stamped on arrival, the first of a burst is the latest of all.
     """
 
     def __init__(self, apart_ns: int) -> None:
         self._apart_ns = apart_ns
-        self._last_ns: int | None = None
+        self._last_ns: int | None = None  # of those that are used
+        self._begin_ns = 0
+        self._recent_ns = deque[int]()
 
     def drops(self, stamp_ns: int) -> bool:
         """Return whether a measurement is too many; if not, the next is held against it."""
-        if self._last_ns is not None and 0 < stamp_ns - self._last_ns < self._apart_ns:
+        close = self._last_ns is not None and 0 < stamp_ns - self._last_ns < self._apart_ns
+        if self._is_fast(stamp_ns) and close:
             return True
         self._last_ns = stamp_ns
         return False
+
+    def _is_fast(self, stamp_ns: int) -> bool:
+        """Whether the sensor is too fast, with a measurement that is now counted."""
+        recent = self._recent_ns
+        if not recent or stamp_ns < recent[-1]:
+            recent.clear()
+            self._begin_ns = stamp_ns
+        recent.append(stamp_ns)
+        while recent[0] <= stamp_ns - _RATE_OVER_NS:
+            recent.popleft()
+        return stamp_ns - self._begin_ns < _RATE_OVER_NS or len(recent) * self._apart_ns > _RATE_OVER_NS

@@ -461,3 +461,16 @@ def test_what_is_faster_than_it_errs_anew_is_thinned(
     assert [m.stamp_ns for m in recording.of(measured)] == [START_NS + k * S // 20 for k in range(60)]
     reasons = [(row.outcome, row.reason) for row in recording.rows if row.sensor == "fast"]
     assert reasons == 240 * [(Outcome.REJECTED, THINNED)]
+
+
+@pytest.mark.parametrize("burst", [2, 5])
+def test_fixes_of_a_slow_receiver_that_are_stamped_in_bursts_are_not_thinned(burst: int, tmp_path: Path) -> None:
+    """10 a second, through a gateway: the first of each burst, the latest of all, was used alone, and a run of fives was 1.2 m off, not 0.6."""
+    make, items = Messages(2), []
+    for k in range(100):
+        at_ns = START_NS + k * S // 10
+        came_ns = START_NS + (k // burst + 1) * burst * S // 10 + (k % burst) * S // 1000
+        items += [("/imu", at_ns, make.imu(at_ns)), ("/fix", came_ns, make.fix(came_ns, 57.7 + 1e-6 * k))]
+    recording = read_recording(write_bag(tmp_path / "run", make, items, "mcap"), vessel())
+    used = [m.stamp_ns for m in recording.of(GnssPosition)]
+    assert sum(stamp_ns > START_NS + 3 * S for stamp_ns in used) >= 70  # until then it may be a fast one

@@ -564,24 +564,18 @@ def test_memory_does_not_grow() -> None:
 
 
 def test_headings_and_fixes_faster_than_they_err_anew_are_thinned() -> None:
-    """Each heading and fix said again 10, 20 and 30 ms later: as if it were said once, with a row for each."""
-    more: Arrivals = []
-    for a in arrivals_of(drift()):
-        later = (10, 20, 30) if isinstance(a.m, CompassHeading | GnssPosition) else ()
-        more += [
-            a,
-            *(
-                replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns + ms * 1_000_000, seq=10**6 * ms + a.m.seq))
-                for ms in later
-            ),
-        ]
-    fed, _ = whole(drift(), more)
-    assert complaints(more, fed) == []
-    once, _ = in_order()
+    """At 50 Hz: as if every third had come alone, with a row for each of the others."""
+    scenario = replace(bl_scenario(1, "drift"), duration_s=20.0, imu_hz=50.0, gnss_hz=50.0, compass_hz=50.0)
+    run = slowly(simulate(scenario, 0), RATE_HZ)
+    fast = {kind: run.recording.of(kind) for kind in (CompassHeading, GnssPosition)}
+    many = {m.seq for said in fast.values() for n, m in enumerate(said) if n % 3}
+    fed, _ = whole(run, arrivals_of(run))
+    alone, _ = whole(run, [a for a in arrivals_of(run) if a.m.seq not in many])
+    assert complaints(arrivals_of(run), fed) == []
     thinned = [row for row in fed.rows if row.reason == THINNED]
-    assert len(thinned) == 3 * sum(isinstance(a.m, CompassHeading | GnssPosition) for a in arrivals_of(drift()))
+    assert {row.seq for row in thinned} == many
     assert {row.outcome for row in thinned} == {Outcome.REJECTED}
-    np.testing.assert_allclose(fed.errors_m, once.errors_m, atol=1e-9)
+    np.testing.assert_allclose(fed.errors_m, alone.errors_m, atol=1e-9)
 
 
 # Prediction
