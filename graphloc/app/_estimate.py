@@ -15,7 +15,6 @@ from graphloc.errors import InputError, SolveError
 from graphloc.eval import calibrate, ekf, holdout
 from graphloc.eval.digerud import run_digerud
 from graphloc.eval.gnss_check import GnssOffset, gnss_offsets
-from graphloc.eval.match_picture import Gallery
 from graphloc.eval.mount_check import MountDoubt, mount_doubts
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.eval.tag_check import suspect_tags
@@ -26,7 +25,7 @@ from graphloc.frontends._part import Bags
 from graphloc.frontends.aerial import Match, match_bag
 from graphloc.frontends.bag import read_recording
 from graphloc.frozen_receiver import without_frozen_fixes
-from graphloc.gather import Scans, with_matches, with_sightings, with_surveys
+from graphloc.gather import Matches, Scans, with_matches, with_sightings, with_surveys
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.offsets import Probe
 from graphloc.recording import Progress, Recording, quiet
@@ -86,9 +85,10 @@ def smooth_recording(
     recording = with_synthetic(recording, config, datum)
     matched = scans is not None and bool(config.of_kind("aerial"))
     solution = solve(recording, config, datum, probe=None if matched else calibrate.PROBE, progress=progress)
-    gallery = Gallery()
+    pictures: tuple[tuple[str, bytes], ...] = ()
     if scans is not None and matched:
-        recording, solution, gallery = _matched(recording, config, datum, solution, scans, progress)
+        found, solution = _matched(recording, config, datum, solution, scans, progress)
+        recording, pictures = found.recording, found.pictures
     filters: tuple[ekf.FilterResult, ...] = ()
     online, never = None, ""
     if compare:
@@ -106,7 +106,7 @@ def smooth_recording(
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution,
         held=_when_measured(held, solution),
-        filters=filters, online=online, pictures=tuple(gallery.pictures()), tags=tags,
+        filters=filters, online=online, pictures=pictures, tags=tags,
         calibration=calibrate.calibrate(recording, config, solution),
     )  # fmt: skip
     return made_comparable(_with_underlay(run, scans))
@@ -114,41 +114,43 @@ def smooth_recording(
 
 def _matched(
     recording: Recording, config: VesselConfig, datum: Datum, alone: Solution, scans: Scans, progress: Progress
-) -> tuple[Recording, Solution, Gallery]:
+) -> tuple[Matches, Solution]:
     """Match scans around a solution without matches, and solve with them; once more where that leaves much open, if some are used.
-
-    Where it leaves more open than windows hold (GNSS is gone), the right place may lie outside, and among fingers and boats another one
-    looks like it. So it is grown there: solved with the matches within reach, scans are matched around that, and so on.
 
     Scans that are matched together with others are once more matched in any case, alone at first: others are placed by the track, and so
     they inherit the bends of one without matches.
-
-    Returns:
-        The recording with its matches, the solution with these, and pictures of some.
     """
-    gallery = Gallery()
     single = _matched_alone(config)
-    first = with_matches(recording, single, datum, alone, scans, progress, gallery)
-    found = first
-    for _ in range(_MOST_GROWN if found.cut_off and found.beyond else 0):
-        grown = solve(found.within_reach, config, datum, progress=progress)
-        if _matches_used(grown, config) < _FEWEST_MATCHES:
-            break
-        another = Gallery()
-        again = with_matches(recording, single, datum, grown, scans, progress, another)
-        if len(again.beyond) > _GAINS * len(found.beyond):
-            break
-        found, gallery = again, another
-        if not found.beyond:
-            break
+    first = with_matches(recording, single, datum, alone, scans, progress)
+    found = _grown(first, recording, single, datum, scans, progress)
     solution = solve(found.recording, config, datum, probe=calibrate.PROBE, progress=progress)
     if single is not config or (found.cut_off and _matches_used(solution, config) >= _FEWEST_MATCHES):
-        gallery = Gallery()
-        found = with_matches(recording, config, datum, solution, scans, progress, gallery)
+        found = with_matches(recording, config, datum, solution, scans, progress)
         solution = solve(found.recording, config, datum, probe=calibrate.PROBE, progress=progress)
     warnings = (*found.recording.warnings, *first.turned, *first.late)
     doubts = (*found.recording.clock_doubts, *first.late)
-    return replace(found.recording, warnings=warnings, clock_doubts=doubts), solution, gallery
+    return found._replace(recording=replace(found.recording, warnings=warnings, clock_doubts=doubts)), solution
+
+
+def _grown(
+    found: Matches, recording: Recording, config: VesselConfig, datum: Datum, scans: Scans, progress: Progress
+) -> Matches:
+    """Return matches around a track that has grown from those within reach, while more come into reach.
+
+    Where a solution leaves more open than windows hold (GNSS is gone), the right place may lie outside, and among fingers and boats another
+    one looks like it. So it is solved with the matches within reach, scans are matched around that, and so on.
+    """
+    for _ in range(_MOST_GROWN if found.cut_off else 0):
+        if not found.beyond:
+            break
+        solution = solve(found.within_reach, config, datum, progress=progress)
+        if _matches_used(solution, config) < _FEWEST_MATCHES:
+            break
+        again = with_matches(recording, config, datum, solution, scans, progress)
+        if len(again.beyond) > _GAINS * len(found.beyond):
+            break
+        found = again
+    return found
 
 
 def _matches_used(solution: Solution, config: VesselConfig) -> int:

@@ -6,7 +6,16 @@ Matches are made around the track of a solved run (`with_matches`), or scan by s
 
 from graphloc.gather._gathering import Gathering
 from graphloc.gather._live import LiveMatching, with_busy_warning
-from graphloc.gather._matches import Scans, with_matches
+from graphloc.gather._matches import Matches, Scans, with_matches
 from graphloc.gather._sightings import with_sightings, with_surveys
 
-__all__ = ["Gathering", "LiveMatching", "Scans", "with_busy_warning", "with_matches", "with_sightings", "with_surveys"]
+__all__ = [
+    "Gathering",
+    "LiveMatching",
+    "Matches",
+    "Scans",
+    "with_busy_warning",
+    "with_matches",
+    "with_sightings",
+    "with_surveys",
+]

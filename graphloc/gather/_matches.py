@@ -52,7 +52,7 @@ class Matches(NamedTuple):
     Attributes:
         cut_off: many of the windows were too small for what the solution left open. turned: what is said of headings (`turned_heading`).
         late: what is said of stamps by how headings turn (`late_turns`).
-        beyond: `seq` of the matches whose windows were.
+        beyond: `seq` of the matches whose windows were. pictures: captions and JPEGs of some.
     """
 
     recording: Recording
@@ -60,6 +60,7 @@ class Matches(NamedTuple):
     turned: list[str]
     late: Sequence[str] = ()
     beyond: frozenset[int] = frozenset()
+    pictures: tuple[tuple[str, bytes], ...] = ()
 
     @property
     def within_reach(self) -> Recording:
@@ -76,14 +77,13 @@ def with_matches(
     solution: Solution,
     scans: Scans,
     progress: Progress = quiet,
-    gallery: Gallery | None = None,
 ) -> Matches:
     """Add the matches of every aerial sensor, made around a solution; a scan that gave none is a row of the ledger.
 
     Raises:
         InputError: an image or LiDAR that cannot be used.
     """
-    gathered, track = Gathering(recording), solution.trajectory
+    gathered, track, gallery = Gathering(recording), solution.trajectory, Gallery()
     span_s = int((track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9)
     tried, cut_off, turned, late, beyond = 0, 0, list[str](), list[str](), set[int]()
     for name, sensor in config.of_kind("aerial").items():
@@ -94,8 +94,7 @@ def with_matches(
         for item in found:
             if item.match is not None:
                 tried, cut_off = tried + 1, cut_off + item.match.cut_off
-                if gallery is not None:
-                    gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
+                gallery.offer(item.match, name, (item.stamp_ns - int(track.stamps_ns[0])) / 1e9)
             if item.match is not None and item.match.modes:
                 matched += 1
                 best, prior = item.match.modes[0], item.match.prior
@@ -113,7 +112,8 @@ def with_matches(
         late += late_turns(
             name, sensor, around, np.array(turned_ns, dtype=np.int64), np.array([turn for turn, _ in turns])
         )
-    return Matches(gathered.recording(), cut_off > _CUT_OFF * tried, turned, late, frozenset(beyond))
+    pictures = tuple(gallery.pictures())
+    return Matches(gathered.recording(), cut_off > _CUT_OFF * tried, turned, late, frozenset(beyond), pictures)
 
 
 def _when_scanned(track: Trajectory, late_s: float) -> Trajectory:
