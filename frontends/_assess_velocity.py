@@ -141,10 +141,8 @@ def velocity_report(
     if axes is None and _OF_LOG.search(f"{stream.topic} {stream.frame_id}"):
         axes, why = BODY_AXES, f"by the names of its topic and frame; {why}"
     if of_log(stream.topic) or through_water(stream.topic):
-        axes, why = (
-            BODY_AXES,
-            f"a speed {'through the water' if through_water(stream.topic) else 'over ground by a log'}; {why}",
-        )
+        past = "through the water" if through_water(stream.topic) else "over ground by a log"
+        axes, why = BODY_AXES, f"a speed {past}; {why}"
     rows = stream.rows[sane(stream)]
     reverse = axes == BODY_AXES and pose is None and len(rows) > 0 and _astern(rows[:, -3])
     return VelocityReport(

@@ -135,9 +135,7 @@ def _nmea_speed(text: str, wanted: str, through: str = "ground") -> Row | None:
     said = nmea.log_velocity_mps(text, [wanted], through)
     if isinstance(said, Rejection) and said.outcome is Outcome.MALFORMED:
         return None
-    return (
-        (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (said[0], said[1] if len(said) > 1 else 0.0, 0.0)
-    )
+    return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (*said, *(0.0,) * (3 - len(said)))
 
 
 # Of a sentence: the message type that says the same, and its row; None of a damaged one.
@@ -322,6 +320,14 @@ class Sentences:
     unread: dict[str, Counter[str]] = field(default_factory=dict)
     after_s: dict[str, list[float]] = field(default_factory=dict)
 
+    def take(self, topic: str, text: str, places: Sequence[str], at_ns: int) -> None:
+        """Take in a message, stamped or recorded at `at_ns`; `places`: the streams that it tells a place of."""
+        self.unread.setdefault(topic, Counter()).update(nmea.unread(text))
+        for stream in places:
+            after_s = at_ns * 1e-9 - nmea.time_of_day_s(text, stream.partition(" ")[2])
+            if np.isfinite(after_s):
+                self.after_s.setdefault(stream, []).append(float(_within_half_a_day(after_s)))
+
     def spread_s(self, stream: str) -> tuple[float, float, float] | None:
         """Return the 5 %, 50 % and 95 % points of `after_s` of a stream, of all its talkers; None where too few tell."""
         topic, _, said = stream.partition(" ")
@@ -329,10 +335,13 @@ class Sentences:
         if len(told) < _FEWEST_TIMES:
             return None
         about = np.median(told)  # not about noon
-        low, middle, high = np.percentile(
-            np.remainder(np.array(told) - about + _DAY_S / 2.0, _DAY_S) - _DAY_S / 2.0, [5.0, 50.0, 95.0]
-        )
+        low, middle, high = np.percentile(_within_half_a_day(np.array(told) - about), [5.0, 50.0, 95.0])
         return float(about + low), float(about + middle), float(about + high)
+
+
+def _within_half_a_day(seconds: Any) -> Any:
+    """Return times (...), s, less whole days."""
+    return np.remainder(seconds + _DAY_S / 2.0, _DAY_S) - _DAY_S / 2.0
 
 
 def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree, Sentences]:
@@ -386,20 +395,20 @@ def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> Sentence
             msg = bag.decode(raw)
             said = _sentences(raw.topic, msg, streams) if raw.topic in mixed else _plain(raw, msg, streams)
             if raw.topic in mixed:
-                sentences.unread.setdefault(raw.topic, Counter()).update(nmea.unread(nmea.text_of(msg)))
+                at_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns) or raw.log_ns
+                sentences.take(raw.topic, nmea.text_of(msg), _places(said), at_ns)
         except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything; counted
             said = [(streams[raw.topic], None)] if raw.topic in streams else []
         if raw.topic == TF_STATIC:
             tree.take(raw.msgtype, msg)
         for stream, row in said:
             _add(stream, row, raw, msg)
-            if raw.topic in mixed and stream.msgtype == NAV_SAT_FIX and row is not None and np.isfinite(row[:2]).all():
-                at_s = (stamp_ns_of(msg, raw.msgtype, raw.log_ns) or raw.log_ns) * 1e-9
-                after_s = at_s - nmea.time_of_day_s(nmea.text_of(msg), stream.topic.partition(" ")[2])
-                if np.isfinite(after_s):
-                    within = (after_s + _DAY_S / 2.0) % _DAY_S - _DAY_S / 2.0
-                    sentences.after_s.setdefault(stream.topic, []).append(within)
     return sentences
+
+
+def _places(said: Sequence[tuple[TopicData, Row | None]]) -> list[str]:
+    """Return the names of the streams of which a place is told."""
+    return [s.topic for s, row in said if s.msgtype == NAV_SAT_FIX and row is not None and np.isfinite(row[:2]).all()]
 
 
 def _add(stream: TopicData, row: Row | None, raw: RawMessage, msg: Any) -> None:

@@ -102,7 +102,8 @@ def with_matches(
                     turns.append((float(wrap_angle(best.pose[2] - prior.pose[2])), float(prior.sigma[2])))
                     turned_ns.append(item.stamp_ns)
                 taken = gathered.take(item.match.fix(item.stamp_ns, name, item.since, sensor.axes))
-                beyond |= {taken.seq} if item.match.cut_off else set()
+                if item.match.cut_off:
+                    beyond.add(taken.seq)
             else:
                 gathered.refuse(name, item.stamp_ns, item.why_not)
             progress("matching", min(int((item.stamp_ns - track.stamps_ns[0]) / 1e9), span_s), span_s)

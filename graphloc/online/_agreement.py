@@ -32,9 +32,8 @@ class Agreement:
     def __init__(self, timeline: LiveTimeline) -> None:
         self._timeline = timeline
         self.agreed_ns: dict[str, int] = {}
-        self._newest: dict[
-            str, tuple[int, bool]
-        ] = {}  # that agreed, by sensor: stamp, and whether by a slow error that is hardly possible
+        # That agreed, by sensor: stamp, and whether by a slow error that is hardly possible.
+        self._newest: dict[str, tuple[int, bool]] = {}
         # Stamps of the first few absolute measurements that disagreed since the last that agreed.
         self._refused: list[int] = []
         self._denied: dict[str, int] = {}  # by sensor: how many in a row disagreed, whatever slow error is allowed

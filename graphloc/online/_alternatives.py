@@ -104,10 +104,7 @@ def _without(
     # Inverse of the innovation covariance of the removal.
     inverse = np.linalg.inv(root)
     values, vectors = np.linalg.eigh(np.eye(len(rows)) - inverse @ cov[np.ix_(rows, rows)] @ inverse.T)
-    looser, there_m = (
-        1.0 / np.maximum(values, _LOOSEST),
-        np.where(values > _TELLS, 1.0 / np.maximum(values, _TELLS), 0.0),
-    )
+    told = values > _TELLS
     by_root = cov[:, rows] @ inverse.T @ vectors
-    step = by_root * there_m @ (vectors.T @ inverse @ raw)
-    return step, cov + by_root * looser @ by_root.T, bool((values <= _TELLS).any())
+    step = by_root * np.where(told, 1.0 / np.maximum(values, _TELLS), 0.0) @ (vectors.T @ inverse @ raw)
+    return step, cov + by_root / np.maximum(values, _LOOSEST) @ by_root.T, not told.all()
