@@ -244,11 +244,11 @@ def test_an_older_fix_that_is_judged_again_does_not_bring_back_a_jump_that_has_e
     lag = after_12_s()
     fix = lag.problem.streams["gnss"]
     entry, agreement = lag._judge._group(fix)[-1], Agreement(lag.problem.timeline)  # noqa: SLF001
-    for t_s, off_m, incredible in ((0, 20.0, ["gnss"]), (1, 0.0, []), (0, 20.0, [])):
+    for t_s, off_m, unlikely in ((0, 7.0, ["gnss"]), (1, 0.0, []), (0, 7.0, []), (2, 5.0, [])):
         at = replace(entry.verdict.at, slow_value=np.array([off_m, 0.0, 0.0]))
         m = replace(entry.measurement, stamp_ns=lag.newest.stamp_ns + t_s * 1_000_000_000)
         agreement.note(fix, m, replace(entry.verdict, weight=1.0, at=at))
-        assert agreement.incredible(str) == incredible
+        assert agreement.unlikely(str) == unlikely
 
 
 def test_a_rebuild_does_not_begin_the_wait_for_the_end_of_a_jump_anew() -> None:

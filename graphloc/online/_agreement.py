@@ -13,8 +13,8 @@ from graphloc.measurements import Measurement
 from graphloc.online._live import LiveStream, LiveTimeline
 from graphloc.position_jumps import MEAN_S
 from graphloc.solve._decide import AGREES, CREDIBLE, Verdict, far_sigmas
+from graphloc.solve._health import FAR_OFF
 
-_USUAL = 3.0  # sigmas of a jumping slow error: beyond them the level that it jumped from may be the wrong one
 _FEW = 8  # absolute measurements in a row must disagree; fewer are no sign
 # Of disagreement, until the estimate is lost; measurements of one sensor in a row that must disagree.
 _LOST_S, _DENIES = 15.0, 3
@@ -32,7 +32,7 @@ class Agreement:
     def __init__(self, timeline: LiveTimeline) -> None:
         self._timeline = timeline
         self.agreed_ns: dict[str, int] = {}
-        # That agreed, by sensor: stamp, and whether by a slow error that is hardly possible.
+        # That agreed, by sensor: stamp, and whether by a slow error that is unlikely so large.
         self._newest: dict[str, tuple[int, bool]] = {}
         # Stamps of the first few absolute measurements that disagreed since the last that agreed.
         self._refused: list[int] = []
@@ -49,9 +49,10 @@ class Agreement:
         self._denied[stream.name] = 0 if agrees else self._denied.get(stream.name, 0) + 1
         if verdict is not None and agrees:
             far = far_sigmas(stream.slow, verdict.at)
-            self._note_level(m.stamp_ns, usual=far <= _USUAL)
+            # Farther off, the level that it jumped from may be the wrong one.
+            self._note_level(m.stamp_ns, usual=far <= FAR_OFF)
             # Older ones are judged again after newer ones.
-            self._newest[stream.name] = max(self._newest.get(stream.name, (0, False)), (m.stamp_ns, far > CREDIBLE))
+            self._newest[stream.name] = max(self._newest.get(stream.name, (0, False)), (m.stamp_ns, far > FAR_OFF))
         if verdict is not None and agrees and _credible(stream, verdict.at):
             self.agreed_ns[stream.name] = max(m.stamp_ns, self.agreed_ns.get(stream.name, m.stamp_ns))
             self._refused = [stamp for stamp in self._refused if stamp > m.stamp_ns]
@@ -77,8 +78,8 @@ class Agreement:
         self._denied.clear()
         self._jumped_ns = None
 
-    def incredible(self, receiver_of: Callable[[str], str]) -> list[str]:
-        """Return the sensors whose newest measurement that agrees does so only by a slow error which is hardly possible.
+    def unlikely(self, receiver_of: Callable[[str], str]) -> list[str]:
+        """Return the sensors whose newest measurement that agrees does so only by a slow error which is unlikely so large.
 
         Args:
             receiver_of: the name of a sensor's receiver (`VesselConfig.receiver_of`): of those that read one by turns the newest counts.

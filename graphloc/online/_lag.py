@@ -30,7 +30,7 @@ from graphloc.online._unmodelled import BeforeStart, ErrorSizes, UnmodelledError
 from graphloc.online._window import Window
 from graphloc.position_jumps import why_in_doubt
 from graphloc.solve._decide import AGREES
-from graphloc.solve._health import why_incredible, why_late
+from graphloc.solve._health import why_late, why_unlikely
 from graphloc.solve._imu_noise import log_likelihood
 from graphloc.solve._warnings import noisier_warning
 from graphloc.solve._wrong_imu import most_motion
@@ -251,7 +251,7 @@ class Lag:
     def in_doubt(self, stamp_ns: int) -> str:
         """Return why the health cannot be good at a stamp; empty where nothing is wrong.
 
-        The only position sensor has jumped, scans are stamped far off, or a sensor agrees only by a slow error that is hardly possible.
+        The only position sensor has jumped, scans are stamped far off, or a sensor agrees only by a slow error that is unlikely so large.
         """
         streams = self.problem.streams.items()  # where a slow error is left out, the bounds include it
         doubtful = [n for n, s in streams if (s.left_out is None or s.jumps) and s.receiver.jump.doubtful(stamp_ns)]
@@ -260,8 +260,8 @@ class Lag:
             for n, s in streams
             if s.slow is not None and s.slow.late is not None and TIME_OFFSET in s.receiver.far_off
         ]
-        incredible = self._agreement.incredible(self.problem.config.receiver_of)
-        return "; ".join([*map(why_in_doubt, doubtful), *map(why_late, late), *map(why_incredible, incredible)])
+        unlikely = self._agreement.unlikely(self.problem.config.receiver_of)
+        return "; ".join([*map(why_in_doubt, doubtful), *map(why_late, late), *map(why_unlikely, unlikely)])
 
     @property
     def denied(self) -> Mapping[str, int]:

@@ -44,9 +44,9 @@ def why_late(sensor: str) -> str:
     return f"the stamps of {sensor} are far off what stamp_sigma_s allows for"
 
 
-def why_incredible(sensor: str) -> str:
-    """Return why no pose is called good beside a sensor that agrees only by a slow error which is hardly possible."""
-    return f"{sensor} agrees only by more than {CREDIBLE:g} sigmas of its slow error: it contradicts the others"
+def why_unlikely(sensor: str) -> str:
+    """Return why no pose is called good beside a sensor that agrees only by a slow error which is unlikely to be so large."""
+    return f"{sensor} agrees only by more than {FAR_OFF:g} sigmas of its slow error: it contradicts the others"
 
 
 def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[str]:
@@ -73,15 +73,13 @@ def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[st
         if stream.row.absolute:
             receivers.setdefault(problem.config.receiver_of(stream.name), []).append(stream)
     for by_turns in receivers.values():
-        names = _incredible(problem, by_turns, result.verdicts)
-        said = [why_incredible(name) if name else own for own, name in zip(said, names, strict=True)]
+        names = _unlikely(problem, by_turns, result.verdicts)
+        said = [why_unlikely(name) if name else own for own, name in zip(said, names, strict=True)]
     return said
 
 
-def _incredible(
-    problem: Problem, by_turns: Sequence[Stream], verdicts: dict[tuple[int, int], Verdict]
-) -> Sequence[str]:
-    """Return the sensor whose newest measurement that agrees does so only by a slow error which is hardly possible, at each state.
+def _unlikely(problem: Problem, by_turns: Sequence[Stream], verdicts: dict[tuple[int, int], Verdict]) -> Sequence[str]:
+    """Return the sensor whose newest measurement that agrees does so only by a slow error which is unlikely so large, at each state.
 
     Before the first one, it is the one to come: a smoother knows it. Empty where there is none.
 
@@ -89,7 +87,7 @@ def _incredible(
         by_turns: those that read one receiver, or a single one.
     """
     agrees = sorted(
-        (m.stamp_ns, stream.name if far_sigmas(stream.slow, verdict.at) > CREDIBLE else "")
+        (m.stamp_ns, stream.name if far_sigmas(stream.slow, verdict.at) > FAR_OFF else "")
         for stream in by_turns
         for i, m in enumerate(stream.measurements)
         if (verdict := verdicts[stream.number, i]).weight >= AGREES
