@@ -20,7 +20,7 @@ from graphloc.factors import INERTIAL, SENSORS
 from graphloc.factors.imu import Links
 from graphloc.keys import is_pose
 from graphloc.ledger import Outcome
-from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix
+from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, Measurement, PoseFix
 from graphloc.online import OnlineSmoother
 from graphloc.online._agreement import Agreement
 from graphloc.online._lag import Lag
@@ -28,8 +28,9 @@ from graphloc.online._live import live_problem
 from graphloc.online._repeated_fix import RepeatedFixDetector
 from graphloc.online._setup import Setup
 from graphloc.online._window import Window
+from graphloc.solution import Health
 from graphloc.time import stamps_of
-from tests.faults import FAULTS, Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
+from tests.faults import FAULTS, Arrival, Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
 from tests.slowly import slowly
 
 RATE_HZ = 2.5  # of states
@@ -249,6 +250,40 @@ def test_an_older_fix_that_is_judged_again_does_not_bring_back_a_jump_that_has_e
         m = replace(entry.measurement, stamp_ns=lag.newest.stamp_ns + t_s * 1_000_000_000)
         agreement.note(fix, m, replace(entry.verdict, weight=1.0, at=at))
         assert agreement.unlikely(str) == unlikely
+
+
+def test_matches_that_contradict_the_receiver_from_the_start_leave_both_open() -> None:
+    """An image may be out of date: the matches agree with each other, 7 m (3.5 sigmas of its slow error) from the receiver."""
+
+    def moved(m: Measurement) -> Measurement:
+        if not isinstance(m, PoseFix):
+            return m
+        away_m = np.eye(len(m.axes))[0] * 7.0
+        return replace(m, news=0.5, modes=tuple(replace(mode, value=mode.value + away_m) for mode in m.modes))
+
+    fed = whole([Arrival(a.true_ns, moved(a.m)) for a in arrivals_of(run_of())])
+    off = np.array(fed.errors_m) > 3.0
+    assert off[-50:].all()  # the matches are believed, as there is no saying
+    held = np.array([e.bound_95_m for e in fed.estimates]) >= fed.errors_m
+    assert held[off].mean() > 0.95
+    assert not any(e.health is Health.GOOD for e, astray in zip(fed.estimates, off, strict=True) if astray)
+
+
+@pytest.mark.parametrize(("off_m", "doubted"), [([1.0] * 17 + [7.0], False), ([1.0] * 5 + [7.0], True), ([7.0, 5.0], True),
+                                                ([7.0] + [5.0] * 20, True), ([7.0] + [1.0] * 17, False)])  # fmt: skip
+def test_a_receiver_that_agreed_with_matches_for_long_is_wrong_where_it_contradicts_them(off_m: list[float], doubted: bool) -> None:  # fmt: skip
+    """By a second; 15 s within two sigmas of 2 m confirm that the matches are right."""
+    lag = after_12_s()
+    fix, match = lag.problem.streams["gnss"], lag.problem.streams["matcher"]
+    seen, entry = (lag._judge._group(s)[-1] for s in (match, fix))  # noqa: SLF001
+    assert isinstance(seen.measurement, PoseFix)
+    agreement = Agreement(lag.problem.timeline)
+    for t_s, one_m in enumerate(off_m):
+        stamp_ns = lag.newest.stamp_ns + t_s * 1_000_000_000
+        agreement.note(match, replace(seen.measurement, stamp_ns=stamp_ns, news=0.1), replace(seen.verdict, weight=1.0))
+        at = replace(entry.verdict.at, slow_value=np.array([one_m, 0.0, 0.0]))
+        agreement.note(fix, replace(entry.measurement, stamp_ns=stamp_ns), replace(entry.verdict, weight=1.0, at=at))
+    assert agreement.doubted == ["gnss"] * doubted
 
 
 def test_a_rebuild_does_not_begin_the_wait_for_the_end_of_a_jump_anew() -> None:

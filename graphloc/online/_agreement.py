@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import expit
@@ -20,6 +21,33 @@ _FEW = 8  # absolute measurements in a row must disagree; fewer are no sign
 _LOST_S, _DENIES = 15.0, 3
 _JUMPED_S = (60.0, 200.0)  # the longest a jump lasts: after a short, and after a long time at the level before it
 _BENT_S = 20.0  # without a position, dead reckoning is as far off as a slow error
+# Of a receiver beside matches: for how long, s, it must have agreed by a slow error of so many sigmas before they are taken to be
+# right where it is far off; how old, s, the newest match may be.
+_CONFIRMS_S, _CONFIRMS, _BESIDE_S = 15.0, 2.0, 5.0
+
+
+class _Standing(NamedTuple):
+    """How a sensor agreed last: when, and whether only by a slow error that is unlikely so large.
+
+    Attributes:
+        confirmed_s: for how long it has agreed by a usual one while matches did. doubted: beside matches it was far off before it ever did
+            so for long: either may be wrong.
+    """
+
+    stamp_ns: int = 0
+    far: bool = False
+    confirmed_s: float = 0.0
+    doubted: bool = False
+
+    def then(self, stamp_ns: int, far_sigmas: float, beside: bool) -> _Standing:
+        """Return how it stands after it has agreed again, by a slow error of so many sigmas; beside: whether matches agree, too."""
+        if stamp_ns <= self.stamp_ns:  # older ones are judged again after newer ones
+            return self
+        since_s = min((stamp_ns - self.stamp_ns) * 1e-9, 1.0)
+        confirmed_s = self.confirmed_s + (since_s if beside and far_sigmas <= _CONFIRMS else 0.0)
+        far = far_sigmas > FAR_OFF
+        doubted = confirmed_s < _CONFIRMS_S and (self.doubted or (beside and far))
+        return _Standing(stamp_ns, far, confirmed_s, doubted)
 
 
 class Agreement:
@@ -32,8 +60,8 @@ class Agreement:
     def __init__(self, timeline: LiveTimeline) -> None:
         self._timeline = timeline
         self.agreed_ns: dict[str, int] = {}
-        # That agreed, by sensor: stamp, and whether by a slow error that is unlikely so large.
-        self._newest: dict[str, tuple[int, bool]] = {}
+        self._standing: dict[str, _Standing] = {}
+        self._matched_ns = 0  # stamp of the newest match that agreed
         # Stamps of the first few absolute measurements that disagreed since the last that agreed.
         self._refused: list[int] = []
         self._denied: dict[str, int] = {}  # by sensor: how many in a row disagreed, whatever slow error is allowed
@@ -51,8 +79,10 @@ class Agreement:
             far = far_sigmas(stream.slow, verdict.at)
             # Farther off, the level that it jumped from may be the wrong one.
             self._note_level(m.stamp_ns, usual=far <= FAR_OFF)
-            # Older ones are judged again after newer ones.
-            self._newest[stream.name] = max(self._newest.get(stream.name, (0, False)), (m.stamp_ns, far > FAR_OFF))
+            if stream.row.false is not None and stream.row.false(m, stream.config).news < 1.0:
+                self._matched_ns = max(self._matched_ns, m.stamp_ns)
+            beside = abs(m.stamp_ns - self._matched_ns) < _BESIDE_S * 1e9
+            self._standing[stream.name] = self._standing.get(stream.name, _Standing()).then(m.stamp_ns, far, beside)
         if verdict is not None and agrees and _credible(stream, verdict.at):
             self.agreed_ns[stream.name] = max(m.stamp_ns, self.agreed_ns.get(stream.name, m.stamp_ns))
             self._refused = [stamp for stamp in self._refused if stamp > m.stamp_ns]
@@ -85,19 +115,24 @@ class Agreement:
             receiver_of: the name of a sensor's receiver (`VesselConfig.receiver_of`): of those that read one by turns the newest counts.
         """
         newest: dict[str, tuple[int, bool, str]] = {}
-        for name, (stamp_ns, far) in self._newest.items():
+        for name, standing in self._standing.items():
             receiver = receiver_of(name)
-            newest[receiver] = max(newest.get(receiver, (0, False, "")), (stamp_ns, far, name))
+            newest[receiver] = max(newest.get(receiver, (0, False, "")), (standing.stamp_ns, standing.far, name))
         return sorted(name for _, far, name in newest.values() if far)
+
+    @property
+    def doubted(self) -> list[str]:
+        """Names of the sensors that have been far off beside matches since before they ever agreed with them for long: either may be wrong."""
+        return [name for name, standing in self._standing.items() if standing.doubted]
 
     def marked(self) -> _Mark:
         """Return the state, for `back_to`."""
         levels = self._usual_ns, self._jumped_ns, self._told_ns
-        return dict(self.agreed_ns), dict(self._newest), list(self._refused), dict(self._denied), *levels
+        return dict(self.agreed_ns), dict(self._standing), list(self._refused), dict(self._denied), *levels
 
     def back_to(self, mark: _Mark) -> None:
         """Forget what was noted since `marked`: it agreed with choices that were given up."""
-        self.agreed_ns, self._newest, self._refused, self._denied = mark[:4]
+        self.agreed_ns, self._standing, self._refused, self._denied = mark[:4]
         self._usual_ns, self._jumped_ns, self._told_ns = mark[4:]
 
     def inherit(self, before: Agreement) -> None:
@@ -108,6 +143,8 @@ class Agreement:
                 would seem to begin with it.
         """
         self.agreed_ns.update(before.agreed_ns)
+        self._standing = self._standing | before._standing
+        self._matched_ns = max(self._matched_ns, before._matched_ns)
         self._usual_ns, self._told_ns = before._usual_ns, before._told_ns
         begin_ns = self._timeline.stamps_ns[self._timeline.first]
         if before._jumped_ns is not None and before._jumped_ns < begin_ns:
@@ -142,9 +179,7 @@ class Agreement:
         return jumped_s if jumped_s > float(np.clip(end - begin, *_JUMPED_S)) else 0.0
 
 
-_Mark = tuple[
-    dict[str, int], dict[str, tuple[int, bool]], list[int], dict[str, int], tuple[int, int] | None, int | None, int
-]
+_Mark = tuple[dict[str, int], dict[str, _Standing], list[int], dict[str, int], tuple[int, int] | None, int | None, int]
 
 
 def _credible(stream: LiveStream, at: Attachment) -> bool:

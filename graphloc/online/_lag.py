@@ -40,6 +40,7 @@ _STEP_COST = 1.0
 _STEP_M = 0.3  # a commit that moves the newest state by more is followed by further iterations
 # Share of the measurements that denied an estimate, that must agree with another; and of a sensor with outliers.
 _EXPLAINED, _HALF = 0.8, 0.5
+_EITHER = 0.5  # probability that a receiver is right which matches contradict and never confirmed
 _MOST_STEPS, _STANDS = 10, 0.1  # largest number of iterations; relative change of the cost at which they end
 
 
@@ -185,14 +186,16 @@ class Lag:
 
     @property
     def others(self) -> tuple[Array, Array]:
-        """What other choices of modes, and the other level of a receiver that jumped, add to the newest position in world.
+        """What other choices of modes, and the other level of a receiver that jumped or contradicts matches, add to the newest position in world.
 
         Mean (3,), m, and covariance (3, 3), m^2.
         """
         mean, cov = self._judge.others
-        share, timeline = self._agreement.wrong_level(self.newest.stamp_ns), self.problem.timeline
+        jumped, doubted = self._agreement.wrong_level(self.newest.stamp_ns), self._agreement.doubted
+        timeline = self.problem.timeline
         for stream in self.problem.streams.values():
-            if share and stream.left_out is not None and stream.slow is not None:
+            share = jumped if stream.left_out is not None else _EITHER if stream.name in doubted else 0.0
+            if share and stream.slow is not None:
                 off_m = self._window.values.atVector(keys.slow(stream.number, timeline.slow_of[timeline.last]))
                 off_m = np.where(stream.slow.far_axes, off_m, 0.0)
                 cov = cov + share * np.outer(off_m, off_m)
