@@ -104,6 +104,18 @@ def test_two_sensors_know_it_to_centimetres_where_there_is_rtk(
     assert np.mean([health is Health.GOOD for health in two.health]) > 0.9
 
 
+def test_no_pose_is_good_beside_a_receiver_that_agrees_by_over_three_sigmas_of_its_slow_error() -> None:
+    """Offline; 2 m is one sigma, and the fixes are constantly so far from the matches: with 5 m they may be right."""
+
+    def good(away_m: float) -> float:
+        with_matches = replace(TRACK, pose_hz=1.0, false_fraction=0.0, duration_s=20.0)
+        _, two = receiver(lambda t: False, lambda t: (away_m, 0.0), with_matches)
+        solution, *_ = solved(two, app.smooth_recording)
+        return float(np.mean([health is Health.GOOD for health in solution.health]))
+
+    assert (good(5.0), good(7.0)) == (1.0, 0.0)
+
+
 @pytest.mark.parametrize("solve", [app.smooth_recording, app.replay_recording], ids=["offline", "online"])
 def test_poses_are_good_again_once_rtk_is_back_after_a_jump_of_the_other_fixes(
     solve: Callable[[Recording, VesselConfig], app.Run],
