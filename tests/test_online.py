@@ -565,7 +565,7 @@ def test_memory_does_not_grow() -> None:
 
 def test_headings_and_fixes_faster_than_they_err_anew_are_thinned() -> None:
     """At 50 Hz: as if every third had come alone, with a row for each of the others."""
-    scenario = replace(bl_scenario(1, "drift"), duration_s=20.0, imu_hz=50.0, gnss_hz=50.0, compass_hz=50.0)
+    scenario = replace(bl_scenario(1, "drift"), duration_s=13.0, imu_hz=50.0, gnss_hz=50.0, compass_hz=50.0)
     run = slowly(simulate(scenario, 0), RATE_HZ)
     fast = {kind: run.recording.of(kind) for kind in (CompassHeading, GnssPosition)}
     many = {m.seq for said in fast.values() for n, m in enumerate(said) if n % 3}

@@ -22,7 +22,9 @@ from graphloc.berths import seen_from
 from graphloc.eval.simulate import SimulatedRun, find_scenario, simulate
 from graphloc.eval.simulate._light import tag_in_world
 from graphloc.eval.simulate.scene import scene_of
+from graphloc.eval.tag_check import suspect_tags
 from graphloc.frames import Array, wrap_angle
+from graphloc.ledger import Ledger
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement, TagSighting, TagView
 from graphloc.survey import Survey, TagConfig, load_survey
 from tests import tagfactory
@@ -378,6 +380,27 @@ def test_tags_whose_faces_are_given_in_another_convention_are_named() -> None:
         right, told = (float(part.split()[-1]) for part in line.split(" would do")[0].split(" instead of "))
         assert (told - right) % 360.0 == pytest.approx(90.0, abs=5.0)
     assert "elsewhere than its mount says" not in said
+
+
+@pytest.mark.parametrize("swung_deg", [10.0, -10.0, 40.0, -40.0])
+def test_a_face_is_turned_by_more_than_a_heading_may_be_off(swung_deg: float, fixed: Docked) -> None:
+    """A track that swings about the quay, its heading with it, shows each tag turned by as much: 10 deg are no other convention."""
+    solved = fixed.run.solution
+    (tag,) = (t for t in tagfactory.survey_of(fixed.truth).tags if t.id == 227)
+    about, swing = np.array(tag.xyz_m), Rotation.from_euler("z", swung_deg, degrees=True).as_matrix()
+    track = solved.trajectory
+    swung = replace(
+        track, p_world_m=(track.p_world_m - about) @ swing.T + about, R_world_body=swing @ track.R_world_body
+    )
+    refused = Ledger(replace(row, weight=0.0) if row.sensor == "tags" else row for row in solved.ledger)
+    lines = suspect_tags(
+        fixed.run.recording, fixed.run.config, replace(solved, trajectory=swung, ledger=refused, slow={})
+    )
+    faces = [line for line in lines if "it stands where the survey says, and faces" in line]
+    assert [line.split(":")[1].strip() for line in faces] == (
+        ["tag 226", "tag 227", "tag 228"] if abs(swung_deg) > 30 else []
+    )
+    assert all(abs(float(line.split("faces ")[1].split()[0]) - abs(swung_deg)) < 4.0 for line in faces)
 
 
 def test_a_quay_that_is_off_is_not_taken_for_tags_that_face_the_other_way() -> None:

@@ -172,13 +172,13 @@ def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> A
     T = values.atPose3(keys.pose(k))
     v = values.atVector(keys.velocity(k))
     bias = values.atConstantBias(keys.bias(j))
-    T_state_sensor, dv, turn = stream.mount, np.zeros(3), np.eye(3)
+    T_state_sensor, dv, carried_to = stream.mount, np.zeros(3), None
     carried = stream.carry[i]
     if carried is not None:
         floor, pim = carried
-        there = pim.predict(nav_state(values, floor), bias)
+        there = pim.predict(gtsam.NavState(T, v) if floor == k else nav_state(values, floor), bias)
         carried_to = T.between(there.pose())
-        T_state_sensor, turn = carried_to.compose(stream.mount), carried_to.rotation().matrix()
+        T_state_sensor = carried_to.compose(stream.mount)
         dv = np.asarray(there.velocity()) - v
     slow_key = None if stream.slow is None else keys.slow(stream.number, j)
     return Attachment(
@@ -198,17 +198,18 @@ def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> A
         slow_age_s=max(int(stream.measurements[i].stamp_ns) - int(problem.timeline.slow_stamps_ns[j]), 0) * 1e-9,
         slow_walk=_slow_walk(problem, stream, i),
         constants=constants_of(stream, values),
-        felt=_felt(problem, stream.felt[i], turn, bias) if asks_for_delay(stream.constants) else None,
+        felt=_felt(problem, stream.felt[i], carried_to, bias) if asks_for_delay(stream.constants) else None,
     )
 
 
 def asks_for_delay(constants: Sequence[Constant]) -> bool:
-    """Return whether the delay of a sensor's stamps is one of its constants: only then is asked what the IMU feels (0.2 ms each)."""
+    """Return what the IMU feels; `carried_to`: body at the measurement, from that at the state; None: they are the same."""
     return any(TIME_OFFSET in constant.corrects for constant in constants)
 
 
-def _felt(problem: Sited, raw: Array, turn: Array, bias: Any) -> FeltMotion:
-    """Return what the IMU feels; `turn` (3, 3): from the body at the measurement to that at the state."""
+def _felt(problem: Sited, raw: Array, carried_to: Any, bias: Any) -> FeltMotion:
+    """Return what the IMU feels; `carried_to`: the body at the measurement, seen from that at the state; None: it is the same."""
+    turn = np.eye(3) if carried_to is None else carried_to.rotation().matrix()
     force = raw[:3] - problem.R_body_imu @ bias.accelerometer()
     return FeltMotion(turn @ force, turn @ raw[3:], problem.links.gravity_mps2)
 

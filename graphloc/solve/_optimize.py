@@ -50,14 +50,15 @@ def optimize(
             following, error, used = _of(stepper), float(stepper.error()), used + 1
             if not error < _HOPELESS * (initial + 1.0):  # also where it is not a number
                 break
-            promised = linear.error(values.zeroVectors()) - linear.error(values.localCoordinates(following))
-            values = following
             if error < lowest:
-                best, lowest = values, error
+                best, lowest = following, error
             enough = relative_tol * error + _ABSOLUTE_TOL
-            if abs(last - error) <= enough or abs(last - error - promised) <= _AS_PROMISED * enough:
+            if abs(last - error) <= enough:
                 break
-            last = error
+            promised = linear.error(values.zeroVectors()) - linear.error(values.localCoordinates(following))
+            if abs(last - error - promised) <= _AS_PROMISED * enough:
+                break
+            values, last = following, error
             del linear  # before the next one is made
     except RuntimeError:
         pass  # a full step led to where states are undetermined: the damped method stays near the start
