@@ -42,49 +42,29 @@ from graphloc.time import NS_PER_S, seconds_between
 from graphloc.trajectory import Trajectory
 
 _H = np.kron(np.eye(3), [1.0, 0.0])  # (3, 6): places of x, vx, y, vy, z, vz
+_DT_S, _GATE_M = 0.04, 2.0  # as printed; the step is the same for every sighting, whatever time passed
+_R = 11.0 * np.eye(3)  # of the measured position, m^2
 _FOCAL_PX = 1069.38  # of D's camera; OpenCV refines too little where it is given rays instead of pixels
 _ATTITUDE_RAD = float(np.radians(10.0))  # of a pose at about 10 m, unless it is flipped; the filter has no attitude
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DigerudConfig:
-    """D app. B as printed.
-
-    Attributes:
-        dt_s: time step, the same for every sighting, s; None: the true one. Q is that of one step in either case.
-        r: variance of the measured position, each axis, m^2.
-        gate_m: poses this far from the state, or farther, are dropped.
-        number: id of the tag to use (printed: 227), of the family in which it is seen most; None: the tag seen most often.
-            Only the camera that sees it most is used.
-    """
-
-    dt_s: float | None = 0.04
-    r: float = 11.0
-    gate_m: float = 2.0
-    number: int | None = None
-
-
-def run_digerud(
-    recording: Recording, config: VesselConfig, options: DigerudConfig | None = None
-) -> FilterResult | None:
+def run_digerud(recording: Recording, config: VesselConfig) -> FilterResult | None:
     """Run the filter; None if its tag was sighted less than twice, which does not make a track.
 
     The track is of the body at the sightings' stamps, with the attitude of the last accepted pose (sigma 10 deg about each axis),
-    so a flip turns the vessel. With the printed step it has no velocity: the filter's is per 0.04 s, whatever time passed, and
-    would distort the interpolation. P is the filter's own, of the camera.
+    so a flip turns the vessel. It has no velocity: the filter's is per 0.04 s, whatever time passed, and would distort the
+    interpolation. P is the filter's own, of the camera. The tag is the one seen most often (D's: 227), by the camera that sees it most.
 
     Args:
         recording: sightings of enabled sensors are used; those of other tags get rows in the ledger.
         config: which sensors are enabled.
-        options: None: as printed.
     """
-    o = options or DigerudConfig()
     sightings = [
         m
         for m in recording.measurements
         if isinstance(m, TagSighting) and (sensor := config.sensors.get(m.sensor)) is not None and sensor.enabled
     ]
-    seen = Counter((m.sensor, m.camera, tag) for m in sightings for tag in m.tags if o.number in (None, tag[1]))
+    seen = Counter((m.sensor, m.camera, tag) for m in sightings for tag in m.tags)
     if not seen:
         return None
     chosen = seen.most_common(1)[0][0]
@@ -106,17 +86,15 @@ def run_digerud(
         if state is None:
             state = _State(m.stamp_ns, _H.T @ p_world_camera, np.eye(6), R_world_body)
         away_m = float(np.linalg.norm(p_world_camera - _H @ state.x))
-        taken = away_m < o.gate_m
-        state, nis = _filtered(state, m.stamp_ns, p_world_camera, R_world_body if taken else None, o)
-        refused = "" if taken else f"outside the {o.gate_m:g} m gate"
+        taken = away_m < _GATE_M
+        state, nis = _filtered(state, m.stamp_ns, p_world_camera, R_world_body if taken else None)
+        refused = "" if taken else f"outside the {_GATE_M:g} m gate"
         ledger.add(filter_row(m, recording, nis, refused, away_m))
         off_m[m.seq] = _off_m(p_world_camera, m, recording.truth)
         out[m.stamp_ns] = (state, m.t_body_camera_m)  # two at one stamp: the later has both
     if len(out) < 2:
         return None
-    return FilterResult(
-        name="Digerud KF", trajectory=_track(out, timed=o.dt_s is None), ledger=ledger, why=_why(ledger, off_m, o)
-    )
+    return FilterResult(name="Digerud KF", trajectory=_track(out), ledger=ledger, why=_why(ledger, off_m))
 
 
 def _off_m(p_world_camera: Array, m: TagSighting, truth: Trajectory | None) -> float:
@@ -128,7 +106,7 @@ def _off_m(p_world_camera: Array, m: TagSighting, truth: Trajectory | None) -> f
     return float(np.linalg.norm(p_world_camera - there))
 
 
-def _why(ledger: Ledger, off_m: Mapping[int, float], o: DigerudConfig) -> str:
+def _why(ledger: Ledger, off_m: Mapping[int, float]) -> str:
     """Return what the gate did: how many poses it dropped, for how long in a row, how many of them right, and the first pose.
 
     Args:
@@ -141,12 +119,12 @@ def _why(ledger: Ledger, off_m: Mapping[int, float], o: DigerudConfig) -> str:
     shut = [list(rows) for refused, rows in groupby(tried, key=lambda row: row.outcome is Outcome.REJECTED) if refused]
     longest = max(shut, key=lambda rows: rows[-1].stamp_ns - rows[0].stamp_ns)
     lasted_s = seconds_between(longest[0].stamp_ns, longest[-1].stamp_ns)
-    right = sum(off_m[row.seq] < o.gate_m for row in dropped)
-    wrong = sum(off_m[row.seq] >= o.gate_m for row in tried if row.outcome is Outcome.USED)
+    right = sum(off_m[row.seq] < _GATE_M for row in dropped)
+    wrong = sum(off_m[row.seq] >= _GATE_M for row in tried if row.outcome is Outcome.USED)
     return (
-        f"it started on a pose {off_m[tried[0].seq]:.1f} m off, and its gate accepts only poses within {o.gate_m:g} m of its own "
+        f"it started on a pose {off_m[tried[0].seq]:.1f} m off, and its gate accepts only poses within {_GATE_M:g} m of its own "
         f"estimate. Of {len(tried)} sightings of its one tag it rejected {len(dropped)} (for up to {lasted_s:.0f} s without a break), "
-        f"{right} of them right to {o.gate_m:g} m; it accepted {len(tried) - len(dropped)}, {wrong} of them farther off than that, as "
+        f"{right} of them right to {_GATE_M:g} m; it accepted {len(tried) - len(dropped)}, {wrong} of them farther off than that, as "
         "a flipped pose is"
     )
 
@@ -191,14 +169,11 @@ class _State:
     R_world_body: Array
 
 
-def _filtered(
-    before: _State, stamp_ns: int, z: Array, R_world_body: Array | None, o: DigerudConfig
-) -> tuple[_State, float]:
+def _filtered(before: _State, stamp_ns: int, z: Array, R_world_body: Array | None) -> tuple[_State, float]:
     """Return the state after a sighting, and the NIS of its position z (3,); R_world_body None: it is not used."""
-    dt_s = o.dt_s if o.dt_s is not None else seconds_between(before.stamp_ns, stamp_ns)
-    F = np.kron(np.eye(3), [[1.0, dt_s], [0.0, 1.0]])
+    F = np.kron(np.eye(3), [[1.0, _DT_S], [0.0, 1.0]])
     x, P = F @ before.x, F @ before.P @ F.T + np.eye(6)
-    r, S = z - _H @ x, _H @ P @ _H.T + o.r * np.eye(3)
+    r, S = z - _H @ x, _H @ P @ _H.T + _R
     nis = float(r @ np.linalg.solve(S, r))
     if R_world_body is None:
         return _State(stamp_ns, x, P, before.R_world_body), nis
@@ -206,8 +181,8 @@ def _filtered(
     return _State(stamp_ns, x + K @ r, P - K @ _H @ P, R_world_body), nis
 
 
-def _track(out: dict[int, tuple[_State, Array]], *, timed: bool) -> Trajectory:
-    """Return the track of the body from states and lever arms (3,); `timed`: the filter's velocity (of the camera) is valid."""
+def _track(out: dict[int, tuple[_State, Array]]) -> Trajectory:
+    """Return the track of the body from states and lever arms (3,)."""
     states = [state for state, _ in out.values()]
     x, R = np.array([s.x for s in states]), np.array([s.R_world_body for s in states])
     cov = np.zeros((len(out), 6, 6))
@@ -217,7 +192,6 @@ def _track(out: dict[int, tuple[_State, Array]], *, timed: bool) -> Trajectory:
         stamps_ns=np.array(list(out), dtype=np.int64),
         p_world_m=x[:, ::2] - np.einsum("nij,nj->ni", R, np.array([lever for _, lever in out.values()])),
         R_world_body=R,
-        v_world_mps=x[:, 1::2] if timed else None,
         cov=cov,
     )
 

@@ -76,8 +76,8 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
         if len(m.numbers) == 1:
             by_tag[_key(m)].append(m)
     for key, own in sorted(by_tag.items()):
-        doubted = [m for m in own if _weight(rows, m) < 0.5]
-        if key in said or len(doubted) < max(_FEWEST, _DOUBTED * len(own)):
+        doubted = [] if key in said else _doubted(own, rows)
+        if not doubted:
             continue
         why = _explained(doubted, *track.poses_at(stamps_of(doubted)))
         said[key] = f"{len(doubted)} of {len(own)} sightings disagree with the rest; {why}"
@@ -186,36 +186,46 @@ def _facing_elsewhere(
     A camera's mount that is turned shows the tag elsewhere, too: what puts it nearer to its place is taken for the cause.
     """
     seen: dict[Key, list[tuple[float, float, float]]] = defaultdict(list)
-    doubted = [m for m in sightings if _weight(rows, m) < 0.5]
-    if len(doubted) < max(_FEWEST, _DOUBTED * len(sightings)):
+    if not (doubted := _doubted(sightings, rows)):
         return []
     for m, p, R in zip(doubted, *solution.trajectory.poses_at(stamps_of(doubted)), strict=True):
-        camera, looks = p + R @ m.t_body_camera_m, R @ m.R_body_camera
-        for k, tag in enumerate(m.tags):  # each by itself: no pose explains several
-            corners, own = slice(4 * k, 4 * k + 4), slice(8 * k, 8 * k + 8)
-            middle = m.points_m[corners].mean(axis=0)
-            by_it = [
-                (Rotation.from_matrix(looks @ pose.R).as_rotvec(degrees=True), pose)
-                for pose in poses_of(m.points_m[corners], m.rays[corners], m.cov[own, own])
-            ]
-            if by_it:
-                turn, pose = min(
-                    by_it, key=lambda found: float(np.hypot(*found[0][:2]))
-                )  # an upright tag stays upright
-                by_facing = camera + looks @ (pose.R @ middle + pose.t_m) - middle
-                by_mount = camera + pose.R.T @ pose.t_m
-                seen[m.sensor, tag].append((turn[2], *(float(np.linalg.norm(off)) for off in (by_facing, by_mount))))
+        for k, tag in enumerate(m.tags):
+            if (turned := _turned_about_up(m, k, p, R)) is not None:
+                seen[m.sensor, tag].append(turned)
     lines = []
     for key, found in sorted(seen.items()):
         turn_deg, by_facing_m, by_mount_m = np.array(found).T
-        turns = Rotation.from_euler("z", turn_deg[:, None], degrees=True)
-        usual = turns.mean()
+        usual, scatter_deg = _usual(Rotation.from_euler("z", turn_deg[:, None], degrees=True))
         usual_deg = float(usual.as_rotvec(degrees=True)[2])
-        scatter_deg = float(np.degrees(np.median((usual.inv() * turns).magnitude())))
         nearer = np.median(by_facing_m) < _ALONG * np.median(by_mount_m)
         if len(found) >= _FEWEST and nearer and abs(usual_deg) > max(_FACES_DEG, scatter_deg / _STEADY):
             lines.append(_faces_elsewhere(key, usual_deg, config))
     return lines
+
+
+def _turned_about_up(m: TagSighting, k: int, p: Array, R: Array) -> tuple[float, float, float] | None:
+    """Return how the k-th tag of a sighting is turned from how the survey has it, by the run's pose of body p (3,), R (3, 3): about up, deg.
+
+    And how far from its place it looks, m, if its facing is the cause, and if the camera's mount is. By itself, as no pose explains
+    several; None where none explains it.
+    """
+    camera, looks = p + R @ m.t_body_camera_m, R @ m.R_body_camera
+    corners, own = slice(4 * k, 4 * k + 4), slice(8 * k, 8 * k + 8)
+    poses = poses_of(m.points_m[corners], m.rays[corners], m.cov[own, own])
+    if not poses:
+        return None
+    turns = [Rotation.from_matrix(looks @ pose.R).as_rotvec(degrees=True) for pose in poses]
+    upright = int(np.argmin([np.hypot(*turn[:2]) for turn in turns]))  # a tag that stands upright stays so
+    pose, middle = poses[upright], m.points_m[corners].mean(axis=0)
+    by_facing = camera + looks @ (pose.R @ middle + pose.t_m) - middle
+    by_mount = camera + pose.R.T @ pose.t_m
+    return float(turns[upright][2]), float(np.linalg.norm(by_facing)), float(np.linalg.norm(by_mount))
+
+
+def _usual(turns: Rotation) -> tuple[Rotation, float]:
+    """Return the mean of rotations (N), and how far from it they are, deg, median."""
+    usual = turns.mean()
+    return usual, float(np.degrees(np.median((usual.inv() * turns).magnitude())))
 
 
 def _faces_elsewhere(key: Key, turn_deg: float, config: VesselConfig) -> str:
@@ -245,9 +255,11 @@ def _by_image(sightings: list[TagSighting]) -> list[list[TagSighting]]:
     return list(images.values())
 
 
-def _weight(rows: Mapping[int, LedgerRow], m: TagSighting) -> float:
-    row = rows.get(m.seq)
-    return 1.0 if row is None or row.weight is None else row.weight
+def _doubted(sightings: list[TagSighting], rows: Mapping[int, LedgerRow]) -> list[TagSighting]:
+    """Return those that the run hardly believes, by their rows of the ledger; none where these are few of all."""
+    weights = [None if (row := rows.get(m.seq)) is None else row.weight for m in sightings]
+    doubted = [m for m, weight in zip(sightings, weights, strict=True) if weight is not None and weight < 0.5]
+    return doubted if len(doubted) >= max(_FEWEST, _DOUBTED * len(sightings)) else []
 
 
 def _size_m(m: TagSighting) -> float:
@@ -352,14 +364,12 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
     track = solution.trajectory
     for sensor, camera in sorted({(m.sensor, m.camera) for m in sightings}):
         own = [m for m in sightings if (m.sensor, m.camera) == (sensor, camera)]
-        doubted = [m for m in own if _weight(rows, m) < 0.5]
-        if len(doubted) < max(_FEWEST, _DOUBTED * len(own)):
+        if not (doubted := _doubted(own, rows)):
             continue
         p, R = track.poses_at(stamps_of(doubted))
         seen = Rotation.from_matrix([B.T @ m.modes[0].R_world_camera for m, B in zip(doubted, R, strict=True)])
-        usual = seen.mean()
+        usual, scatter_deg = _usual(seen)
         off_deg = float(np.degrees((usual.inv() * Rotation.from_matrix(doubted[0].R_body_camera)).magnitude()))
-        scatter_deg = float(np.degrees(np.median((usual.inv() * seen).magnitude())))
         # With the attitude that they agree on: where all stand elsewhere, the heading without them may be off as well.
         as_seen = [replace(m, R_body_camera=usual.as_matrix()) for m in doubted]
         offs = np.array([_by_tags(m, B) for m, B in zip(as_seen, R, strict=True)]) - p

@@ -37,4 +37,4 @@ def _theirs() -> tuple[Sensor, ...]:
 SENSORS: tuple[Sensor, ...] = (*_OURS, *_theirs())
 KINDS: dict[str, type[SensorConfig]] = {INERTIAL.kind: INERTIAL.config, **{row.kind: row.config for row in SENSORS}}
 
-__all__ = ["GROUP", "INERTIAL", "KINDS", "SENSORS"]
+__all__ = ["INERTIAL", "KINDS", "SENSORS"]

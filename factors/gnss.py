@@ -29,7 +29,6 @@ from graphloc.factors._receiver import late_and_off, stamps_and_antenna
 from graphloc.frames import Array, Datum, Geodetic, skew
 from graphloc.graph import (
     Attachment,
-    Constant,
     Decision,
     GraphUpdate,
     Hint,
@@ -145,11 +144,6 @@ def slow(config: GnssConfig) -> SlowProcess | None:
     )
 
 
-def constants(config: GnssConfig) -> tuple[Constant, ...]:
-    """Return how much later than stamped fixes were measured, s, and how far off the antenna is, m, as far as that is not known."""
-    return stamps_and_antenna(config)
-
-
 def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:
     """Return the fix that the attachment's estimate would give."""
     lat, lon, height = at.datum.geodetic_from_enu(_predicted_m(at, config))[0]
@@ -179,7 +173,7 @@ ROW = Sensor(
     ideal=ideal,
     hint=hint,
     slow=slow,
-    constants=constants,
+    constants=stamps_and_antenna,
     scaled=lambda _fix: {"sigma_scale": [0, 1]},
     absolute=True,
     company=True,

@@ -21,7 +21,7 @@ from graphloc.config import VelocityConfig
 from graphloc.factors._noise import with_floors
 from graphloc.factors._receiver import late_and_off, stamps_and_antenna
 from graphloc.frames import Array, Datum, skew
-from graphloc.graph import Attachment, Constant, Hint, Residual, Sensor
+from graphloc.graph import Attachment, Hint, Residual, Sensor
 from graphloc.measurements import GnssVelocity
 
 
@@ -70,11 +70,6 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
     )
 
 
-def constants(config: VelocityConfig) -> tuple[Constant, ...]:
-    """Return how much later than stamped velocities were measured, s, and how far off the antenna is, m, as far as that is not known."""
-    return stamps_and_antenna(config)
-
-
 def ideal(at: Attachment, config: VelocityConfig) -> GnssVelocity:
     """Return the noise-free velocity at the attachment's state."""
     return GnssVelocity(
@@ -98,6 +93,6 @@ ROW = Sensor(
     residuals=residuals,
     ideal=ideal,
     hint=hint,
-    constants=constants,
+    constants=stamps_and_antenna,
     company=True,
 )

@@ -37,8 +37,7 @@ from graphloc.series import integral, runs
 from graphloc.time import NS_PER_S
 from graphloc.white_noise import white_noise
 
-# Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
-_COURSE_S, _LEFT_OF_TURNS = 12.0, 0.5
+_LEFT_OF_TURNS = 0.5  # of the changes of a course, that the turning about the right axis leaves at most
 _UPSIDE_DOWN_DEG = 150.0
 # Quiet seconds in a row; for how long it is slow, at most, that only changes its direction.
 _QUIET_S, _STANDS_S = 2, 1.5
@@ -251,7 +250,7 @@ def _against_courses(imu: TopicData, report: ImuReport, courses: Courses | None,
     if courses is None or len(courses.stamps_ns) < 20:
         return 0
     turning, course = turning_of(imu, report, tree, body), np.unwrap(courses.course_rad)
-    return course_against_turning(turning, courses.stamps_ns, course, _COURSE_S)
+    return course_against_turning(turning, courses.stamps_ns, course)
 
 
 def _turning_axis(
@@ -265,7 +264,7 @@ def _turning_axis(
     for axis in axes:
         mount = replace(report.mount, rpy_deg=vec(np.degrees(rpy_from_rotation(_level(axis)))))
         turning = turning_of(imu, replace(report, mount=mount), tree, body)
-        left.append(left_of_turns(turning, courses.stamps_ns, course, _COURSE_S))
+        left.append(left_of_turns(turning, courses.stamps_ns, course))
     return axes[int(np.argmin(left))] if min(left) < _LEFT_OF_TURNS else None
 
 

@@ -41,11 +41,16 @@ _SET = ("imu", "gnss", "gnss_velocity", "body_velocity", "compass")  # whose clo
 def with_clock(block: list[str], inspection: Inspection) -> list[str]:
     """Return the block of a sensor with lines on its clock, where there is anything to say."""
     kind, topic = _value(block, "kind"), _value(block, "topic")
-    topics = {t.topic.partition(" ")[0]: t for t in inspection.topics}
+    topics = _by_topic(inspection)
     if topic not in topics:
         return block
     own = topics[topic]
     return [*block, *_stamp_lines(kind, own), *_drift_lines(own), *_offset_lines(kind, topic, topics, inspection)]
+
+
+def _by_topic(inspection: Inspection) -> dict[str, TopicReport]:
+    """Return the reports by topic, the last of those that share it: of NMEA a report is of a sentence."""
+    return {t.topic.partition(" ")[0]: t for t in inspection.topics}
 
 
 def _value(block: list[str], key: str) -> str:
@@ -140,7 +145,7 @@ def _after(kind: str, topic: str, inspection: Inspection) -> Vec | None:
 
 def clock_lines(inspection: Inspection) -> list[str]:
     """Say which sensors are stamped by a clock that is not the IMU's."""
-    topics = {t.topic.partition(" ")[0]: t for t in inspection.topics}
+    topics = _by_topic(inspection)
     named = [imu.topic for imu in inspection.imus] + [gnss.topic for gnss in inspection.gnss]
     named += [twist.topic for twist in inspection.velocities] + [compass.topic for compass in inspection.compasses]
     lines = []
@@ -167,7 +172,7 @@ def _behind(topic: str, topics: Mapping[str, TopicReport], inspection: Inspectio
 
 def scan_clock_lines(inspection: Inspection, lidars: tuple[MountedTopic, ...]) -> list[str]:
     """Say how far the clocks of LiDARs are off the IMU's, by the recording times; none where they are not, or their stamps are not taken."""
-    topics = {t.topic.partition(" ")[0]: t for t in inspection.topics}
+    topics = _by_topic(inspection)
     imu_s = next((t.latency_s[1] for i in inspection.imus if (t := topics.get(i.topic)) and t.latency_s), None)
     own_s = [lidar.latency_s for lidar in lidars if lidar.latency_s is not None]
     if recorded_lines(inspection, lidars):

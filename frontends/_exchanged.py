@@ -31,7 +31,7 @@ def exchanged_warnings(sensors: Sequence[Readings], motions: Mapping[str, Measur
     name, motion = max(motions.items(), key=lambda item: len(item[1].t_s))
     lines = []
     for r in sensors:
-        own = [v for v in r.values if isinstance(v, GnssVelocity)]
+        own = r.of(GnssVelocity)
         if isinstance(r.config, VelocityConfig) and own and (off := _apart_mps(motion, own)) is not None:
             as_read, exchanged = off
             if exchanged < _CLEARLY * as_read:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import compress
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ from graphloc.ledger import LedgerRow
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
 from graphloc.thinning import THINNED, Thinning
 from graphloc.time import NS_PER_S, utc_text
+
+_Kind = TypeVar("_Kind")
 
 
 @dataclass(slots=True)
@@ -62,6 +64,10 @@ class Readings:
     def logs(self) -> NDArray[np.int64]:
         """Return the recording times as an array."""
         return np.array(self.logs_ns, dtype=np.int64)
+
+    def of(self, kind: type[_Kind]) -> list[_Kind]:
+        """Return its values of a class, in order."""
+        return [v for v in self.values if isinstance(v, kind)]
 
     def drop(self, bad: NDArray[np.bool_], rejection: Rejection) -> list[LedgerRow]:
         """Remove readings and return their ledger rows."""
@@ -205,7 +211,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
     readings.sort()
     rows += _drop_wrong(readings, warnings)
-    samples = [v for v in readings.values if isinstance(v, ImuReading)]
+    samples = readings.of(ImuReading)
     if not samples:
         return None, rows
     series = ImuSeries(
@@ -226,9 +232,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
 
 def _imu_values(readings: Readings) -> Array:
     """Return accelerations and rates (N, 6); of none, (0, 6)."""
-    return np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.values if isinstance(v, ImuReading)]).reshape(
-        -1, 6
-    )
+    return np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.of(ImuReading)]).reshape(-1, 6)
 
 
 def _even_out(readings: Readings, warnings: list[str]) -> None:
@@ -273,10 +277,10 @@ def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
         warnings += _fixes.stamp_warning(readings.sensor, readings.stamps())
     if not isinstance(readings.config, GnssConfig):
         return []
-    bad = _fixes.held([v for v in readings.values if isinstance(v, GnssPosition)])
+    bad = _fixes.held(readings.of(GnssPosition))
     warnings += _fixes.held_warning(readings.sensor, bad)
     rows = readings.drop(bad, rejected("repeats the position of the previous fix under a new stamp: no new evidence"))
-    fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
+    fixes = readings.of(GnssPosition)
     warnings += _fixes.height_warning(readings.sensor, fixes)
     warnings += _fixes.scatter_warning(readings.sensor, fixes, readings.config)
     warnings += _fixes.uneven_warning(readings.sensor, fixes, readings.config)
@@ -299,7 +303,7 @@ def reject_scattered(imu: ImuSeries | None, readings: Readings, warnings: list[s
     """Drop headings that are unrelated to their neighbours."""
     if imu is None or not isinstance(readings.config, CompassConfig):
         return []
-    bad = scattered(imu, [v for v in readings.values if isinstance(v, CompassHeading)])
+    bad = scattered(imu, readings.of(CompassHeading))
     return _drop(readings, bad, rejected(SCATTERED), warnings)
 
 
@@ -334,7 +338,7 @@ def reject_stored(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
 
 def reject_far(readings: Readings, config: VesselConfig, warnings: list[str]) -> list[LedgerRow]:
     """Drop fixes that are far from all others."""
-    fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
+    fixes = readings.of(GnssPosition)
     if not fixes:
         return []
     warnings += _sanity.gnss_warnings(readings.sensor, fixes, config)

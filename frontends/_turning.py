@@ -13,6 +13,10 @@ from graphloc.frontends._turns import without_line
 from graphloc.series import rms
 from graphloc.time import NS_PER_S
 
+# Times over which changes of an angle and of a course are compared: a gyro's bias must be small beside them, and the noise average out.
+# Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
+_ANGLE_S, _COURSE_S = 2.0, 12.0
+_CORRELATED = 0.5  # correlation of these changes that is believed
 _STEADY_S = 120.0  # within it a gyro's bias and a compass's offset are steady
 _FEWEST = 20  # angles, or changes of them, that tell anything
 # Times the span that changes are compared over: more is a gap. What an angle leaps by beside the turning, of either sense.
@@ -30,47 +34,40 @@ class Turning:
     turned_rad: Array
 
 
-def against_turning(
-    turning: Turning | None,
-    at_ns: NDArray[np.int64],
-    angle: Array,
-    over_s: float = 2.0,
-    clear: float = 0.5,
-) -> int:
+def against_turning(turning: Turning | None, at_ns: NDArray[np.int64], angle: Array) -> int:
     """Return +1 where an angle grows as the craft turns to port, -1 where it falls, 0 where nothing tells.
 
     Args:
-        at_ns: (N,), increasing. angle: (N,) rad, unwrapped. over_s: time over which changes are compared: a gyro's bias
-            must be small beside them, and the angle's noise average out. clear: correlation that is believed.
+        at_ns: (N,), increasing. angle: (N,) rad, unwrapped.
     """
-    a, b = _changes(*_beside(turning, at_ns, angle), over_s)
+    a, b = _changes(*_beside(turning, at_ns, angle), _ANGLE_S)
     if len(a) < _FEWEST:
         return 0
     power = float(np.sqrt((a**2).sum() * (b**2).sum()))
     together = float((a * b).sum())
-    return int(np.sign(together)) if abs(together) > clear * power else 0
+    return int(np.sign(together)) if abs(together) > _CORRELATED * power else 0
 
 
-def course_against_turning(turning: Turning, at_ns: NDArray[np.int64], course: Array, over_s: float) -> int:
+def course_against_turning(turning: Turning, at_ns: NDArray[np.int64], course: Array) -> int:
     """Return the same of a course: to half a turn, as it is where the craft goes astern, and if it turns by about as much as the craft does.
 
     Args:
-        at_ns, angle, over_s: as for `against_turning`.
+        at_ns, course: as for `against_turning`.
     """
-    a, b = _changes(*_beside(turning, at_ns, course), over_s)
+    a, b = _changes(*_beside(turning, at_ns, course), _COURSE_S)
     if len(a) < _FEWEST:
         return 0
     along, against = (rms(_to_half_a_turn(a - sense * b)) for sense in (1.0, -1.0))
     return int(along < _CLEARLY * against) - int(against < _CLEARLY * along)
 
 
-def left_of_turns(turning: Turning, at_ns: NDArray[np.int64], angle: Array, over_s: float) -> float:
+def left_of_turns(turning: Turning, at_ns: NDArray[np.int64], course: Array) -> float:
     """Return what part of the changes of a course, to half a turn, a turning leaves, squared: 0 where it turns as the craft does; inf where nothing tells.
 
     Args:
-        at_ns: (N,), increasing. angle: (N,) rad, unwrapped. over_s: as for `against_turning`.
+        at_ns, course: as for `against_turning`.
     """
-    a, b = _changes(*_beside(turning, at_ns, angle), over_s)
+    a, b = _changes(*_beside(turning, at_ns, course), _COURSE_S)
     if len(a) < _FEWEST:
         return np.inf
     power = float((_to_half_a_turn(a) ** 2).sum())

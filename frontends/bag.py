@@ -194,7 +194,7 @@ def _usable(
             rows += reject_repeats(readings) + reject_stored(readings, warnings)
             rows += reject_far(readings, config, warnings) + judge_fixes(readings, warnings)
             rows += thin(readings) + reject_scattered(imu, readings, warnings)
-            measurements += [v for v in readings.values if isinstance(v, Measurement)]
+            measurements += readings.of(Measurement)
     return imu, measurements, rows
 
 
@@ -307,7 +307,7 @@ def _refuse_unit(imu: ImuSeries, sensors: Sequence[Readings]) -> None:
     (config,) = (r.config for r in sensors if r.sensor == imu.sensor and isinstance(r.config, ImuConfig))
     yaws: dict[str, Yaws] = {}
     for readings in sensors:
-        fixes = [v for v in readings.values if isinstance(v, GnssPosition)]
+        fixes = readings.of(GnssPosition)
         if own := _yaws_of(readings):
             yaws[f"the headings of {readings.sensor}"] = own
         elif fixes:
@@ -334,7 +334,7 @@ def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
     lines = []
     for readings in sensors:
         if isinstance(readings.config, CompassConfig):
-            headings = [v for v in readings.values if isinstance(v, CompassHeading)]
+            headings = readings.of(CompassHeading)
             lines += turn_warnings(imu, readings.sensor, headings, readings.config.convention)
             lines += wander_warning(imu, readings.sensor, headings, readings.config)
         elif yaws := _yaws_of(readings):
@@ -344,7 +344,7 @@ def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
 
 def _motions_of_fixes(sensors: Sequence[Readings]) -> dict[str, MeasuredMotion]:
     """Return the motion of each receiver's fixes, as far as these tell one."""
-    fixes = {r.sensor: [v for v in r.values if isinstance(v, GnssPosition)] for r in sensors}
+    fixes = {r.sensor: r.of(GnssPosition) for r in sensors}
     return {sensor: m for sensor, own in fixes.items() if (m := motion_of_fixes(sensor, own))}
 
 

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array, wrap_angle, yaw_from_heading_deg
-from graphloc.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -86,10 +85,3 @@ def rates(value: Array, t_s: Array) -> Array:
         return np.zeros_like(value)
     unwrapped = np.column_stack([value[:, :2], np.unwrap(value[:, 2])])
     return np.asarray(np.gradient(unwrapped, t_s, axis=0))
-
-
-def track_from(berth: Berth, track: Trajectory, moved: Array) -> BerthTrack:
-    """Return a track as it is seen from a berth that has moved by (N, 4) at the track's stamps."""
-    value, _ = seen_from(berth, track.p_world_m, track.yaw_rad, moved)
-    t = (track.stamps_ns - track.stamps_ns[0]) * 1e-9
-    return BerthTrack(berth=berth, stamps_ns=track.stamps_ns, value=value, rate=rates(value, t))

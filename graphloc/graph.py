@@ -116,8 +116,10 @@ class Attachment:
         Args:
             off_m: (3,) how far from its mount the sensor is, in its own axes.
         """
-        lever_m = self.lever_m if off_m is None else self.lever_m + self.T_state_sensor.rotation().matrix() @ off_m
-        return _cross(self.gyro_radps, lever_m)
+        return _cross(self.gyro_radps, self._lever_m(off_m))
+
+    def _lever_m(self, off_m: Array | None) -> Array:
+        return self.lever_m if off_m is None else self.lever_m + self.T_state_sensor.rotation().matrix() @ off_m
 
     def sensor_velocity_mps(self, off_m: Array | None = None) -> Array:
         """Return the velocity (3,) of the sensor at the measurement, world axes, m/s; `off_m`: see `swing_mps`."""
@@ -132,8 +134,7 @@ class Attachment:
         """
         if self.felt is None:
             raise ValueError("an attachment without what the IMU feels")
-        lever_m = self.lever_m if off_m is None else self.lever_m + self.T_state_sensor.rotation().matrix() @ off_m
-        turning = _cross(self.felt.spin_radps2, lever_m) + _cross(self.gyro_radps, self.swing_mps(off_m))
+        turning = _cross(self.felt.spin_radps2, self._lever_m(off_m)) + _cross(self.gyro_radps, self.swing_mps(off_m))
         return np.asarray(self.felt.force_mps2 + turning)
 
     def sensor_acceleration_mps2(self, off_m: Array | None = None) -> Array:

@@ -17,6 +17,9 @@ from graphloc.ledger import Ledger
 from graphloc.offsets import Offsets
 from graphloc.trajectory import Trajectory
 
+CONTRADICTING_COST = 3.0
+"""Cost over the expected one, above which measurements contradict each other: noise that is configured too small alone costs less."""
+
 
 class Health(enum.StrEnum):
     """How far an estimate can be trusted, at one time."""

@@ -80,7 +80,7 @@ def test_all_choices_are_weighed_whichever_is_in_the_graph(held: tuple[int, ...]
     ]  # fmt: skip
     place = 2  # the newest
     J = np.vstack([np.eye(3)[place], np.eye(3)])
-    found = choices(
+    found, unplaced = choices(
         stream(news), range(3), residuals, J @ cov @ J.T, [(0, 1.0) if n in held else None for n in range(3)]
     )
     ways = [tuple(n for n in range(3) if bits[n]) for bits in product([False, True], repeat=3)]
@@ -90,7 +90,7 @@ def test_all_choices_are_weighed_whichever_is_in_the_graph(held: tuple[int, ...]
         assert np.exp(c.log) == pytest.approx(probability(right, news) / total, rel=1e-6)
         assert c.step[0] == pytest.approx(after(right)[0][place] - mean[place], abs=1e-9)
         assert c.cov[0, 0] == pytest.approx(after(right)[1][place, place], abs=1e-9)
-        assert not c.unplaced
+    assert not unplaced
     assert len(found) == len(ways)
     assert found[0].log == max(c.log for c in found)
 
@@ -105,10 +105,10 @@ def test_what_is_known_by_one_measurement_alone_is_not_thrown_elsewhere_by_its_r
     found = Residual(
         raw=np.array([off_m]), cov=np.eye(1) * SIGMA_M**2, jacobian=lambda: np.eye(1), prior=1.0 - FALSE, size_m=None, size_deg=None
     )  # fmt: skip
-    weighed = choices(stream(), [0], [(found,)], np.full((2, 2), var), [(0, 1.0)])
+    weighed, unplaced = choices(stream(), [0], [(found,)], np.full((2, 2), var), [(0, 1.0)])
     (without,) = (c for c in weighed if c.modes == (None,))
     assert abs(without.step[0]) < 1.0
-    assert without.unplaced
+    assert unplaced
     assert without.cov[0, 0] > (5.0 * SIGMA_M) ** 2  # so that it is known badly, which counts by its probability
 
 

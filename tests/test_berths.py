@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphloc.berths import Berth, rates, seen_from, track_from
+from graphloc.berths import Berth, rates, seen_from
 from graphloc.config import AprilTagConfig
 from graphloc.factors.apriltag import berths
 from graphloc.frames import Array
 from graphloc.survey import Survey
-from graphloc.trajectory import Trajectory
 
 STILL = np.zeros((1, 4))
 
@@ -105,21 +104,6 @@ def test_rates_across_the_wrap_and_of_a_single_stamp() -> None:
     value = np.column_stack([10.0 - 0.4 * t, 2.0 * t, angle])
     np.testing.assert_allclose(rates(value, t), np.tile([-0.4, 2.0, 0.2], (4, 1)), atol=1e-9)
     np.testing.assert_array_equal(rates(value[:1], t[:1]), np.zeros((1, 3)))
-
-
-def test_a_track_of_a_berth_that_moves() -> None:
-    """At rest in world before a quay that comes at it by 0.1 m/s."""
-    stamps = np.arange(5, dtype=np.int64) * 1_000_000_000
-    track = Trajectory(
-        stamps_ns=stamps, p_world_m=np.tile([1.0, -6.0, 0.0], (5, 1)), R_world_body=np.tile(np.eye(3), (5, 1, 1))
-    )
-    moved = np.zeros((5, 4))
-    moved[:, 1] = -0.1 * np.arange(5)
-    found = track_from(berth(180.0), track, moved)
-    np.testing.assert_allclose(found.value[:, 0], 6.0 - 0.1 * np.arange(5))
-    np.testing.assert_allclose(found.rate, np.tile([-0.1, 0.0, 0.0], (5, 1)), atol=1e-12)
-    np.testing.assert_allclose(np.degrees(found.value[:, 2]), 90.0)  # yaw 0 is heading 90
-    assert found.cov is None
 
 
 def surveyed(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from graphloc.berths import Berth, BerthTrack, track_from
+from graphloc.berths import Berth, BerthTrack, rates, seen_from
 from graphloc.eval.docking import docking_table, tag_range_m
 from graphloc.frames import Array
 from graphloc.survey import DockConfig, Survey, TagConfig
@@ -161,7 +161,9 @@ def _berth(point_m: tuple[float, float, float], facing_deg: float, pivot_m: Arra
 
 def _relative(body: Trajectory, berth: Berth, moved: Array | None = None) -> BerthTrack:
     """The body from the berth; its dock (N, 4) moved, or at rest."""
-    return track_from(berth, body, np.zeros((len(body), 4)) if moved is None else moved)
+    value, _ = seen_from(berth, body.p_world_m, body.yaw_rad, np.zeros((len(body), 4)) if moved is None else moved)
+    t = (body.stamps_ns - body.stamps_ns[0]) * 1e-9
+    return BerthTrack(berth=berth, stamps_ns=body.stamps_ns, value=value, rate=rates(value, t))
 
 
 def _shown(seen: BerthTrack) -> tuple[Array, Array, Array]:

@@ -46,7 +46,7 @@ def setup_of(config: VesselConfig) -> Setup:
 
 @cache
 def run_of(seed: int = 0, length_s: float = 26.0) -> SimulatedRun:
-    return _seldom(replace(bl_scenario(1, "drift", false_fraction=0.1), duration_s=length_s), seed)
+    return _seldom(replace(bl_scenario(1, "drift"), false_fraction=0.1, duration_s=length_s), seed)
 
 
 def _seldom(scenario: Scenario, seed: int, rate_hz: float = RATE_HZ) -> SimulatedRun:
@@ -717,7 +717,7 @@ def test_a_measurement_that_cannot_be_used_is_rejected_alone(monkeypatch: pytest
 
 
 def test_resumes_after_a_kill(tmp_path: Path) -> None:
-    run = simulate(replace(bl_scenario(1, "drift", false_fraction=0.1), duration_s=26.0), 0)  # at full rates
+    run = simulate(replace(bl_scenario(1, "drift"), false_fraction=0.1, duration_s=26.0), 0)  # at full rates
     path, base = tmp_path / "snapshot.json", arrivals_of(run)
     base = base[: at_s(base, 20.0)]
     first = smoother(run, snapshot=path)

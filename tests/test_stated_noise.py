@@ -120,7 +120,7 @@ def test_while_far_off_fixes_keep_their_weight_and_matches_weigh_as_they_scatter
 def shaken(seed: int, duration_s: float = 24.0) -> SimulatedRun:
     """BL's case 1 with good matches, a noisy IMU, and little else."""
     scenario = replace(
-        bl_scenario(1, "drift", false_fraction=0.0), duration_s=duration_s, pose_hz=4.0, pose_sigma_m=0.05,
+        bl_scenario(1, "drift"), false_fraction=0.0, duration_s=duration_s, pose_hz=4.0, pose_sigma_m=0.05,
         gnss_hz=2.0, compass_hz=2.0, accel_noise_ug_per_sqrt_hz=2000.0, gyro_noise_mdps_per_sqrt_hz=40.0,
     )  # fmt: skip
     return slowly(simulate(scenario, seed), 2.5)
@@ -173,7 +173,7 @@ def test_online_an_imu_that_is_noisier_than_its_data_sheet_is_believed_less() ->
 
 def test_vibration_that_does_not_go_on_into_the_motion_is_no_noise() -> None:
     """Its samples scatter by 60 times what is configured."""
-    run = slowly(simulate(replace(bl_scenario(1, "drift", false_fraction=0.0), duration_s=30.0), 1))
+    run = slowly(simulate(replace(bl_scenario(1, "drift"), false_fraction=0.0, duration_s=30.0), 1))
     imu = run.recording.imu
     assert imu is not None
     t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9

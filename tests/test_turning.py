@@ -46,12 +46,12 @@ def test_a_course_of_a_craft_that_goes_astern_turns_as_it_does(gaps_s: float) ->
     k = at(1.0, 1.0, gaps_s)
     astern = np.floor(T_S[k] / 15.0) % 2.0
     course = np.unwrap(np.angle(np.exp(1j * (YAW[k] + 3.0 * NOISE[k] + np.pi * astern))))
-    assert course_against_turning(TURNING, stamps(k), course, 12.0) == 1
-    assert course_against_turning(Turning(0, T_S, -YAW), stamps(k), course, 12.0) == -1
+    assert course_against_turning(TURNING, stamps(k), course) == 1
+    assert course_against_turning(Turning(0, T_S, -YAW), stamps(k), course) == -1
     sideways = YAW[k] / 5.0 + NOISE[k]  # set by the wind, while the bow comes round
-    assert course_against_turning(TURNING, stamps(k), sideways, 12.0) == 0
-    assert left_of_turns(TURNING, stamps(k), course, 12.0) < 0.05
-    assert left_of_turns(Turning(0, T_S, -YAW), stamps(k), course, 12.0) > 1.0
+    assert course_against_turning(TURNING, stamps(k), sideways) == 0
+    assert left_of_turns(TURNING, stamps(k), course) < 0.05
+    assert left_of_turns(Turning(0, T_S, -YAW), stamps(k), course) > 1.0
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 
 from graphloc.eval.plots._errors import HEALTH, consistency, coverage, error_over_time, outages
 from graphloc.eval.plots._interactive import interactive
-from graphloc.eval.plots._map import hover, placed, run_map
+from graphloc.eval.plots._map import hover, run_map
 from graphloc.eval.plots._marks import (
     COLOURS,
     OUTAGE,
@@ -20,7 +20,6 @@ from graphloc.eval.plots._marks import (
     colour_of,
     peaks,
     shown_of,
-    thinned,
 )
 from graphloc.eval.plots._states import berths_over_time, residuals_over_time, slow_over_time
 
@@ -47,10 +46,8 @@ __all__ = [
     "interactive",
     "outages",
     "peaks",
-    "placed",
     "residuals_over_time",
     "run_map",
     "shown_of",
     "slow_over_time",
-    "thinned",
 ]

@@ -20,13 +20,12 @@ from graphloc.frames import Array
 from graphloc.frozen_receiver import FROZEN
 from graphloc.measurements import GnssPosition
 from graphloc.series import rms
-from graphloc.solution import Health, Solution
+from graphloc.solution import CONTRADICTING_COST, Health, Solution
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory, bounds_95
 
 # Shares of the run: called good, called lost, covered by the 95 % bounds, compared at all; beyond, a reader has to look closer.
 _MOSTLY, _LOST, _COVERED, _NOT_COVERED, _MATCHED, _STARTED = 0.5, 0.05, 0.85, 0.5, 0.95, 0.8
-_FAR_OFF = 3.0  # cost over its expectation; `degraded` from there on
 _TOO_SURE = 4.0  # NEES: errors are 1.4 times what the covariance says
 # Of the time in which online's 95 % bounds hold the offline position: that one is better informed, so honest ones do for 95 %.
 _HOLDS_OFFLINE = 0.9
@@ -374,7 +373,7 @@ def _solved(data: ReportData, solution: Solution) -> Iterator[Reason]:
         yield Reason(trust=Trust.NO, text="The solver did not converge: do not rely on this run.")
     else:
         ratio = stats.cost / max(stats.expected_cost, 1.0)
-        trust = Trust.WITH_CARE if ratio > _FAR_OFF else Trust.YES
+        trust = Trust.WITH_CARE if ratio > CONTRADICTING_COST else Trust.YES
         text = (
             f"The solver converged; cost over its expectation {ratio:.2f} (near 1 where the noise is configured right, "
             "below where it is configured too large)."

@@ -99,10 +99,10 @@ class Scenario:
 _FIELDS = tuple(f.name for f in dataclasses.fields(Scenario))
 
 
-def bl_scenario(case: int, noise: GnssNoise, *, false_fraction: float = 0.4) -> Scenario:
+def bl_scenario(case: int, noise: GnssNoise) -> Scenario:
     """Return BL's case 1, 2 or 3 with its GNSS noise."""
     path: Literal["entry", "turn", "still"] = ("entry", "turn", "still")[case - 1]
-    base = Scenario(path=path, case=case, noise=noise, false_fraction=false_fraction)
+    base = Scenario(path=path, case=case, noise=noise)
     if case == 3:
         return replace(base, duration_s=60.0, wave_roll_deg=4.0, wave_pitch_deg=2.0, wave_heave_m=0.2)
     return base

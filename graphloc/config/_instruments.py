@@ -120,6 +120,8 @@ class SlowErrorConfig(Block):
 class GnssConfig(SensorConfig):
     """GNSS position (`sensor_msgs/NavSatFix`, `gps_msgs/GPSFix`, NMEA in `nmea_msgs/Sentence` or `std_msgs/String`, poses in a `grid`, [makers' messages](makers-messages.md))."""
 
+    apart_ns = LEAST_APART_NS
+
     kind: Literal["gnss"] = "gnss"
     """The sensor kind."""
     min_status: Literal["fix", "sbas", "gbas"] = "fix"
@@ -162,13 +164,11 @@ class GnssConfig(SensorConfig):
         """It does where the other fixes are another sensor's."""
         return self.fixes != "any"
 
-    @property
-    def apart_ns(self) -> int:
-        return LEAST_APART_NS
-
 
 class CompassConfig(SensorConfig):
     """Heading: `geometry_msgs/QuaternionStamped`, orientation of `sensor_msgs/Imu`, NMEA (as `gnss`), `std_msgs/Float64` or `Float32`."""
+
+    apart_ns = LEAST_APART_NS
 
     kind: Literal["compass"] = "compass"
     """The sensor kind."""
@@ -192,13 +192,11 @@ class CompassConfig(SensorConfig):
     nmea: Headings = ("HDT", "THS")
     """NMEA sentences to read, from one talker (`HEHDT`) or any (`HDT`): HDT, THS, HDG, HDM, PASHR."""
 
-    @property
-    def apart_ns(self) -> int:
-        return LEAST_APART_NS
-
 
 class VelocityConfig(SensorConfig):
     """GNSS velocity over ground (`geometry_msgs/TwistWithCovarianceStamped`, `TwistStamped`, `Vector3Stamped`, NMEA and GPSFix as `gnss`)."""
+
+    apart_ns = LEAST_APART_NS
 
     kind: Literal["gnss_velocity"] = "gnss_velocity"
     """The sensor kind."""
@@ -216,16 +214,14 @@ class VelocityConfig(SensorConfig):
     nmea: Velocities = ("VTG",)
     """NMEA sentences to read, from one talker (`GPVTG`) or any (`VTG`): VTG, RMC."""
 
-    @property
-    def apart_ns(self) -> int:
-        return LEAST_APART_NS
-
 
 class BodyVelocityConfig(SensorConfig):
     """Velocity along the vessel, of wheels, a Doppler log or a speed log: twist of `nav_msgs/Odometry` or of `gnss_velocity`'s types.
 
     Also `std_msgs/Float64` or `Float32`, VHW and VBW in NMEA as `gnss`, and Doppler logs' own messages. All along the axes of the sensor.
     """
+
+    apart_ns = LEAST_APART_NS
 
     kind: Literal["body_velocity"] = "body_velocity"
     """Which row of the sensor table reads this block."""
@@ -261,10 +257,6 @@ class BodyVelocityConfig(SensorConfig):
     @classmethod
     def _ordered(cls, axes: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(axis for axis in "xyz" if axis in axes)
-
-    @property
-    def apart_ns(self) -> int:
-        return LEAST_APART_NS
 
 
 class HeightConfig(SensorConfig):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
@@ -59,6 +59,9 @@ else a factor has no effect on what states less."""
 class SensorConfig(Block):
     """What every sensor has."""
 
+    apart_ns: ClassVar[int] = 0
+    """Measurements that follow the one before within less tell nothing new, and are left out (`graphloc.thinning`)."""
+
     kind: str
     """Which row of the sensor table reads this block."""
     topic: str = ""
@@ -93,11 +96,6 @@ class SensorConfig(Block):
     def takes_turns(self) -> bool:
         """Whether it is one of those that read a receiver's fixes by turns (`VesselConfig.by_turns`)."""
         return False
-
-    @property
-    def apart_ns(self) -> int:
-        """Measurements that follow the one before within less tell nothing new, and are left out (`graphloc.thinning`)."""
-        return 0
 
     @property
     def synthetic_every_s(self) -> float:

@@ -37,14 +37,13 @@ class Choice:
     Attributes:
         log: log of its probability. modes: of N measurements, the mode that is right; None: the measurement is false.
         step: (d,) from the present estimate to that of this choice: position first (m, world), then each residual.
-        cov: (d, d), its covariance. unplaced: whether along some direction it is known only by that how far off its mean may be.
+        cov: (d, d), its covariance.
     """
 
     log: float
     modes: tuple[int | None, ...]
     step: Array
     cov: Array
-    unplaced: bool = False
 
 
 def choices(
@@ -53,8 +52,10 @@ def choices(
     residuals: Sequence[tuple[Residual, ...]],
     cov: Array,
     held: Sequence[tuple[int, float] | None],
-) -> list[Choice]:
-    """Return the choices among N measurements of a stream, the most probable first.
+) -> tuple[list[Choice], bool]:
+    """Return the choices among N measurements of a stream, the most probable first, and whether they are unplaced.
+
+    Unplaced: along some direction a choice is known only by that how far off its mean may be.
 
     Args:
         indices: of the measurements. residuals: N tuples, one residual per mode.
@@ -65,7 +66,7 @@ def choices(
     ends = np.cumsum([0, *(len(found[0].raw) for found in residuals)])
     at = [slice(a, b) for a, b in pairwise(ends + len(cov) - ends[-1])]
     step, loose, unplaced = _without(residuals, cov, held, at)
-    found = [Choice(0.0, (), step, loose, unplaced)]
+    found = [Choice(0.0, (), step, loose)]
     for n, model in enumerate(models):
         repeats = model.repeats if n else 0.0
         grown = []
@@ -76,7 +77,7 @@ def choices(
                 step, cov = c.step - gain @ r.raw, c.cov - gain @ c.cov[at[n]]
                 nis = r.nis(P)  # in full: it says whether they agree, not how well the modes look
                 log_right = model.news * (r.log_density(P) + 0.5 * nis) - 0.5 * nis
-                grown.append(Choice(c.log + log_right, (*c.modes, mode), step, cov, unplaced))
+                grown.append(Choice(c.log + log_right, (*c.modes, mode), step, cov))
             log = log_right_and_false(seen, P, model)[1]
             if n and c.modes[-1] is None and repeats > 0.0 and len(seen[0].raw) == len(residuals[n - 1][0].raw):
                 before = tuple(replace(r, raw=r.raw + c.step[at[n - 1]]) for r in residuals[n - 1])
@@ -84,17 +85,17 @@ def choices(
                 walked = P + c.cov[at[n - 1], at[n - 1]] - cross - cross.T
                 again = log_false_again(model, before, seen, walked)
                 log = float(np.logaddexp(np.log1p(-repeats) + log, again))
-            grown.append(Choice(c.log + model.news * log, (*c.modes, None), c.step, c.cov, unplaced))
+            grown.append(Choice(c.log + model.news * log, (*c.modes, None), c.step, c.cov))
         grown.sort(key=lambda c: -c.log)
         found = [c for c in grown[:_MOST] if c.log > grown[0].log - _LEAST]
     total = float(np.logaddexp.reduce([c.log for c in found]))
-    return [replace(c, log=c.log - total) for c in found]
+    return [replace(c, log=c.log - total) for c in found], unplaced
 
 
 def _without(
     residuals: Sequence[tuple[Residual, ...]], cov: Array, held: Sequence[tuple[int, float] | None], at: list[slice]
 ) -> tuple[Array, Array, bool]:
-    """Return step, covariance, and whether it is unplaced, as in `Choice`, after removing all of the measurements from the graph."""
+    """Return step and covariance, as in `Choice`, and whether it is unplaced, after removing all of the measurements from the graph."""
     there = [(n, *h) for n, h in enumerate(held) if h is not None]
     if not there:
         return np.zeros(len(cov)), cov, False

@@ -271,7 +271,7 @@ class Judge:
             attached, found = self._attach(own)
             held = [e.within for e in own]
             cov = self._states.joint(attached, [modes[0] for modes in found])
-            weighed = choices(stream, [e.index for e in own], found, cov, held)
+            weighed, unplaced = choices(stream, [e.index for e in own], found, cov, held)
             best = weighed[0].modes
             now = tuple(h[0] if h is not None and h[1] >= AGREES else None for h in held)
             share, steps = np.exp([c.log for c in weighed]), np.array([c.step[:3] for c in weighed])
@@ -280,9 +280,8 @@ class Judge:
             tells = np.array([np.trace(c.cov[:3, :3]) for c in weighed]) < _LOOSE * np.trace(cov[:3, :3])
             mean = (share * tells) @ steps if best == now else np.zeros(3)
             around = (share[:, None] * (steps - mean)).T @ (steps - mean)
-            around += sum(
-                (p * _more(c.cov, cov) for p, c in zip(share, weighed, strict=True) if c.unplaced), np.zeros((3, 3))
-            )
+            if unplaced:
+                around += sum((p * _more(c.cov, cov) for p, c in zip(share, weighed, strict=True)), np.zeros((3, 3)))
             if np.trace(around) > _SHOWS * np.trace(cov[:3, :3]):
                 self._others[stream.name] = mean, around
             chosen = frozenset((e.index, mode) for e, mode in zip(own, best, strict=True))

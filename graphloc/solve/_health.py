@@ -16,7 +16,7 @@ from graphloc.build import Problem, Stream
 from graphloc.config import VesselConfig
 from graphloc.frames import Array
 from graphloc.position_jumps import LASTS_S, why_in_doubt
-from graphloc.solution import Cause, Health, HealthReason, SolveStats
+from graphloc.solution import CONTRADICTING_COST, Cause, Health, HealthReason, SolveStats
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._decide import AGREES, CREDIBLE, Verdict, far_sigmas
 from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE
@@ -25,8 +25,6 @@ from graphloc.trajectory import Trajectory, bounds_95
 # Health: DNV asks for 2.5 m at 95 % in port (Digerud); beyond 25 m a pose helps nobody there.
 _GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_DEG = 2.5, 25.0, 45.0
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
-CONTRADICTING_COST = 3.0  # over the expected cost: noise that is configured too small alone does not cost so much
-
 
 FAR_OFF = 3.0
 """Sigmas of its setting from which an estimate is said to be far from it."""

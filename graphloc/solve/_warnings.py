@@ -16,10 +16,10 @@ from graphloc.frames import Array
 from graphloc.graph import TIME_OFFSET, Constant, SlowProcess, corrections
 from graphloc.position_jumps import jump_warnings, largest_sigma
 from graphloc.series import runs
-from graphloc.solution import Graded, SolveStats
+from graphloc.solution import CONTRADICTING_COST, Graded, SolveStats
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._decide import AGREES, Verdict
-from graphloc.solve._health import CONTRADICTING_COST, FAR_OFF, late_of
+from graphloc.solve._health import FAR_OFF, late_of
 from graphloc.solve._imu_mount import MountError, mount_sigma_rad
 from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE, too_quiet
 from graphloc.solve._lasting import lasting
