@@ -14,7 +14,7 @@ import pytest
 from rosbags.interfaces import Nodetype
 from scipy.spatial.transform import Rotation
 
-from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig, VesselConfig
+from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig, VesselConfig, load_config
 from graphloc.frames import wrap_angle
 from graphloc.frontends._assess import Courses
 from graphloc.frontends._assess_compass import compass_report
@@ -26,12 +26,13 @@ from graphloc.frontends._types import MessageTypes
 from graphloc.frontends._vendor_types import VENDOR_TYPES
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import DECODERS, QUATERNION, TWIST, ImuReading, stamp_ns_of
-from graphloc.frontends.inspect import inspect_bag
+from graphloc.frontends.inspect import draft_config, inspect_bag, render
 from graphloc.frontends.vendors import VENDORS
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.makers import said
+from tests.test_bag import KINDS
 from tests.test_inspect import drive, look
 
 ROS2 = Messages(2)
@@ -739,6 +740,55 @@ def test_a_filters_place_stands_behind_a_receivers(ins: bool, tmp_path: Path) ->
     topics = {sensor.topic for sensor in config.sensors.values()}
     assert topics >= {"/oem7/bestpos", "/oem7/bestgnsspos", "/oem7/bestvel"} | ({"/oem7/inspvax"} if ins else set())
     assert ("by its name, or its messages, a filter's output" in text) == ins
+
+
+def _urban(make: Messages, at: int, fix: Any, v: Any, heading_deg: float, ahead_s: int) -> list[Item]:
+    """A car with a receiver, and an inertial system as its reference; the computer's clock is ahead of UTC."""
+    since_ms = (at - ahead_s * S - utc_ns("1980-01-06")) // 1_000_000 + 18_000
+    week, tow_ms = divmod(since_ms, 604_800_000)
+    pvt = said(
+        make, COMM + "GnssPVTSolnMsg", time={"week": week, "tow": tow_ms / 1000.0}, fix_type=3, valid_fix=True, latitude=fix.latitude,
+        longitude=fix.longitude, altitude=fix.altitude, h_acc=1.2, v_acc=2.0, vel_n=v[1], vel_e=v[0], vel_d=-v[2], vel_acc=0.25,
+    )  # fmt: skip
+    header = {"gps_week": week, "gps_week_seconds": tow_ms}
+    place = {"position_type": 56, "latitude": fix.latitude, "longitude": fix.longitude, "altitude": fix.altitude, "latitude_std": 0.02, "longitude_std": 0.02, "altitude_std": 0.04}  # fmt: skip
+    ins = said(
+        make, SPAN + "INSPVAX", header=header, ins_status=3, north_velocity=v[1], east_velocity=v[0], up_velocity=v[2],
+        azimuth=heading_deg, azimuth_std=0.1, **place,
+    )  # fmt: skip
+    best = said(make, SPAN + "BESTPOS", header=header, **place)
+    return [
+        ("/ublox_driver/receiver_pvt", at, pvt),
+        ("/novatel_data/inspvax", at, ins),
+        ("/novatel_data/bestpos", at, best),
+    ]
+
+
+@pytest.mark.parametrize("ahead_s", [0, 18])
+def test_of_a_car_its_receiver_is_used_and_the_inertial_system_is_named_a_filter(ahead_s: int, tmp_path: Path) -> None:
+    make = Messages(1)
+    path = write_bag(tmp_path / "run.bag", make, _spoken(make, partial(_urban, ahead_s=ahead_s)), "ros1")
+    found = inspect_bag(path)
+    text = draft_config(found)
+    (tmp_path / "vessel.yaml").write_text(text)
+    config = load_config(tmp_path / "vessel.yaml", KINDS)
+    used = {(sensor.kind, sensor.topic) for sensor in config.sensors.values() if sensor.enabled}
+    assert used == {
+        ("imu", "/imu"), ("gnss", "/ublox_driver/receiver_pvt"), ("gnss_velocity", "/ublox_driver/receiver_pvt"),
+        ("compass", "/novatel_data/inspvax"),
+    }  # fmt: skip
+    assert text.count("by its name, or its messages, a filter's output") == 4  # two places, a velocity, a heading
+    assert "enabled: false where it is a reference to compare with" in text
+    assert "quality" not in text + render(found)  # of NMEA
+    offsets = [s.time_offset_s for s in config.sensors.values() if s.kind not in ("imu", "height")]
+    assert offsets == pytest.approx([float(ahead_s)] * len(offsets), abs=0.1)
+    assert ("18.0 s behind the IMU's, by the recording times: the IMU's is GPS time" in render(found)) == (ahead_s > 0)
+    recording = read_recording(path, config)
+    kinds = [type(m) for m in recording.measurements]
+    assert [kinds.count(kind) for kind in (GnssPosition, GnssVelocity, CompassHeading)] == [300] * 3
+    imu = recording.imu
+    assert imu is not None
+    assert abs(recording.measurements[0].stamp_ns - int(imu.stamps_ns[0])) < 0.1 * S
 
 
 def test_a_filters_place_alone_is_used_and_says_so(tmp_path: Path) -> None:
