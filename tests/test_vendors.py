@@ -487,7 +487,7 @@ def test_a_bag_without_definitions_is_read_in_each_version(msgtype: str, version
     make = Messages(2)
     fields = {
         "SbgGpsPos": PLACES[SBG + "SbgGpsPos"], "SensorGps": PLACES[PX4 + "SensorGps"] | {"heading": 0.5}, "SbgGpsHdt": {"true_heading": 300.0},
-        "SensorCombined": {"accelerometer_m_s2": (1, 2, 3)}, "SbgEkfEuler": {"angle": vector(0, 0, 1)},
+        "Inspvax": PLACES[SWRI + "Inspvax"], "SensorCombined": {"accelerometer_m_s2": (1, 2, 3)}, "SbgEkfEuler": {"angle": vector(0, 0, 1)},
         "DVL": {"velocity": vector(1, 2, 3), "fom": 0.25, "velocity_valid": True, "altitude": -1.0, "beams": [{"id": k} for k in range(4)], "form": "json_v3"},
     }.get(msgtype.split("/")[-1], {})  # fmt: skip
     if "int32 lat\n" in VENDOR_TYPES[msgtype][version] and fields:
