@@ -16,7 +16,7 @@ from graphloc.config import GnssConfig, SlowErrorConfig
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends import _clock
 from graphloc.frontends._fixes import RTK_SIGMA_M, radians_warning, scatter_m, stored, stored_warning, uneven
-from graphloc.frontends._reports import GnssReport, PartOfFixes, TopicReport, Vec
+from graphloc.frontends._reports import GnssReport, PartOfFixes, TopicReport, Vec, of_nmea
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import IMU, PLAIN_POSE, POSE, UNSTAMPED
@@ -275,7 +275,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
     chords = np.diff(p[:: max(1, len(p) // 400), :2], axis=0)
     precise = sigma is not None and float(sigma[:2].max()) < RTK_SIGMA_M and float(np.median(rows[:, 3])) >= 2.0
     if precise:
-        told = "quality 4 (RTK, fixed)," if " " in fixes.topic else "status gbas (RTK) and a reported"
+        told = "quality 4 (RTK, fixed)," if of_nmea(fixes.topic) else "status gbas (RTK) and a reported"
         why = f"{told} sigma below {RTK_SIGMA_M:g} m"
     elif sigma is None:
         why = "no covariance is reported"

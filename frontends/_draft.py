@@ -438,6 +438,8 @@ def _velocities(inspection: Inspection) -> Iterator[list[str]]:
             continue
         if twist.axes is None and twist.msgtype == VECTOR:
             off = f"nothing tells that it is a velocity; {twist.why}"
+        elif twist is not used and filtered(twist.topic):
+            off = _FILTERED
         elif twist is not used:
             off = f"true if it comes of another receiver than {used.topic if used else 'that'}; {twist.why}"
         yield _velocity_block(_numbered("gnss_velocity", next(world)), twist, gnss, off)
@@ -528,6 +530,8 @@ def _compass_block(name: str, compass: CompassReport, off: str) -> list[str]:
         lines.append(f"  enabled: false  # guess: it repeats {compass.like}, and must not count twice")
     elif off:
         lines.append(f"  enabled: false  # guess: {off}")
+    elif filtered(compass.topic):
+        lines.append(f"  # guess: {_FILTERED}; enabled: false where it is a reference to compare with")
     lines += _mount_lines(compass)
     lines += _error_lines(compass)
     if (compass.msgtype == IMU or filtered(compass.topic)) and not compass.two_antennas:

@@ -153,7 +153,9 @@ def clock_lines(inspection: Inspection) -> list[str]:
         behind, clock = _behind(topic, topics, inspection) or (0.0, "")
         if abs(behind) > EPOCH_LIMIT_S:
             way = "behind" if behind > 0.0 else "ahead of"
-            why = ": GPS time, which is ahead of UTC by 18 s" if abs(behind + GPS_AHEAD_S) < LEAP_S else ""
+            whose = f"{clock} is " if behind > 0.0 else ""
+            gps = abs(abs(behind) - GPS_AHEAD_S) < LEAP_S
+            why = f": {whose}GPS time, which is ahead of UTC by 18 s" if gps else ""
             off = f"{topic}: its clock is {abs(behind):.1f} s {way} {clock}, by the recording times"
             lines.append(f"{off}{why}; drafted as time_offset_s")
     return lines

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from itertools import islice
 
 from graphloc.frontends._draft_clock import clock_lines
-from graphloc.frontends._reports import GnssReport, ImuReport, Inspection, OdometryReport, TopicReport
+from graphloc.frontends._reports import GnssReport, ImuReport, Inspection, OdometryReport, TopicReport, of_nmea
 from graphloc.plain import aligned
 from graphloc.time import utc_text
 
@@ -140,7 +140,7 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
     if gnss.without_height:
         lines.append(f"  {gnss.without_height} messages have no height (NaN) and are used as horizontal fixes")
     if gnss.reported_sigma_m is not None:
-        source = "sigma by quality" if " " in gnss.topic else "reported sigma"
+        source = "sigma by quality" if of_nmea(gnss.topic) else "reported sigma"
         lines.append(f"  {source} east, north, up {' '.join(f'{s:.3f}' for s in gnss.reported_sigma_m)} m")
     if gnss.tf_frame is None:
         lines.append(

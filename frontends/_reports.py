@@ -45,6 +45,11 @@ def of_log(topic: str) -> bool:
     return topic.removesuffix(WATER).endswith(SPEEDS)
 
 
+def of_nmea(topic: str) -> bool:
+    """Return whether a place is one of NMEA, by the name of its stream."""
+    return " " in topic.removesuffix(FILTER)
+
+
 def filtered(topic: str) -> bool:
     """Return whether a place or velocity is a filter's output, by the name of its topic, or what its messages say."""
     return bool(_FILTERED.search(topic))
@@ -205,7 +210,7 @@ class GnssReport:
     def rtk_sigma_m(self) -> tuple[float, float] | None:
         """Horizontal and vertical sigma that its fixes are taken for, m: of RTK that reports no covariance; None for others. NMEA tells it by its quality."""
         augmented = set(self.statuses) - {"no fix"} == {"gbas"}
-        if not augmented or self.reported_sigma_m or self.scatter_m is None or " " in self.topic:
+        if not augmented or self.reported_sigma_m or self.scatter_m is None or of_nmea(self.topic):
             return None
         seen_m = max(self.scatter_m[:2]), self.scatter_m[2]
         return None if seen_m[0] > _RTK_SCATTER_M else (max(_RTK_M[0], seen_m[0]), max(_RTK_M[1], seen_m[1]))

@@ -92,6 +92,45 @@ _OEM7_INS = (
 )
 _OEM7_SETTLED = {"novatel_oem7_msgs__InertialSolutionStatus": "uint32 status"}
 
+# `novatel_gps_msgs`; names of flags are not all those of its versions.
+_NOVATEL_STATE = _flags(
+    "error_flag temperature_flag voltage_supply_flag antenna_powered antenna_is_open antenna_is_shorted cpu_overload_flag com1_buffer_overrun "
+    "com2_buffer_overrun com3_buffer_overrun usb_buffer_overrun rf1_agc_flag rf2_agc_flag almanac_flag position_solution_flag "
+    "position_fixed_flag clock_steering_status_enabled clock_model_flag oemv_external_oscillator_flag software_resource_flag "
+    "aux1_status_event_flag aux2_status_event_flag aux3_status_event_flag"
+)
+_NOVATEL_START = f"{_HEADER}; NovatelMessageHeader novatel_msg_header; "
+_NOVATEL = {
+    "novatel_gps_msgs__NovatelMessageHeader": (
+        "string message_name; string port; uint32 sequence_num; float32 percent_idle_time; string gps_time_status; uint32 gps_week_num; "
+        "float64 gps_seconds; NovatelReceiverStatus receiver_status; uint32 receiver_software_version"
+    ),
+    "novatel_gps_msgs__NovatelReceiverStatus": f"uint32 original_status_code; {_NOVATEL_STATE}",
+}
+_NOVATEL_EXTENDED = {
+    "novatel_gps_msgs__NovatelExtendedSolutionStatus": (
+        "uint32 original_mask; bool advance_rtk_verified; string psueorange_iono_correction"
+    )
+}
+_NOVATEL_SIGNALS = {
+    "novatel_gps_msgs__NovatelSignalMask": (
+        "uint32 original_mask; bool gps_l1_used_in_solution; bool gps_l2_used_in_solution; bool gps_l3_used_in_solution; "
+        "bool glonass_l1_used_in_solution; bool glonass_l2_used_in_solution"
+    )
+}
+_NOVATEL_INS = {
+    "novatel_gps_msgs__NovatelInsExtendedSolutionStatus": (
+        "uint32 original_mask; "
+        + _flags(
+            "position_update phase_update zero_velocity_update wheel_sensor_update align_update external_position_update doppler_update "
+            "pseudorange_update velocity_update dead_reckoning_update phase_wind_up_update course_over_ground_update "
+            "external_velocity_update external_attitude_update ins_solution_converged secondary_ins_solution_used "
+            "turn_on_biases_estimated alignment_direction_verified"
+        )
+        + "; string alignment_type; string nvm_seed_status"
+    )
+}
+
 _SBF = {
     "septentrio_gnss_driver__BlockHeader": (
         "uint8 sync_1; uint8 sync_2; uint16 crc; uint16 id; uint8 revision; uint16 length; uint32 tow; uint16 wnc"
@@ -240,6 +279,60 @@ VENDOR_TYPES: dict[str, tuple[str, ...]] = {
         _definition(
             f"{_HEADER}; Oem7Header nov_header; float64 latitude; float64 longitude; float64 height; {_OEM7_INS}InertialSolutionStatus status",
             **_OEM7, **_OEM7_SETTLED,
+        ),
+    ),
+    **dict.fromkeys(
+        ("gnss_comm/msg/GnssPVTSolnMsg", "gnss_comm_msgs/msg/GnssPVTSolnMsg"),
+        (
+            _definition(
+                "GnssTimeMsg time; uint8 fix_type; bool valid_fix; bool diff_soln; uint8 carr_soln; uint8 num_sv; float64 latitude; "
+                "float64 longitude; float64 altitude; float64 height_msl; float64 h_acc; float64 v_acc; float64 p_dop; float64 vel_n; "
+                "float64 vel_e; float64 vel_d; float64 vel_acc",
+                **dict.fromkeys(("gnss_comm__GnssTimeMsg", "gnss_comm_msgs__GnssTimeMsg"), "uint32 week; float64 tow"),
+            ),
+        ),
+    ),
+    "novatel_gps_msgs/msg/NovatelPosition": (
+        _definition(
+            f"{_NOVATEL_START}string solution_status; string position_type; float64 lat; float64 lon; float64 height; float32 undulation; "
+            "string datum_id; float32 lat_sigma; float32 lon_sigma; float32 height_sigma; string base_station_id; float32 diff_age; "
+            "float32 solution_age; uint8 num_satellites_tracked; uint8 num_satellites_used_in_solution; "
+            "uint8 num_gps_and_glonass_l1_used_in_solution; uint8 num_gps_and_glonass_l1_and_l2_used_in_solution; "
+            "NovatelExtendedSolutionStatus extended_solution_status; NovatelSignalMask signal_mask",
+            **_NOVATEL, **_NOVATEL_EXTENDED, **_NOVATEL_SIGNALS,
+        ),
+    ),
+    "novatel_gps_msgs/msg/NovatelVelocity": (
+        _definition(
+            f"{_NOVATEL_START}string solution_status; string velocity_type; float32 latency; float32 age; float64 horizontal_speed; "
+            "float64 track_ground; float64 vertical_speed",
+            **_NOVATEL,
+        ),
+    ),
+    "novatel_gps_msgs/msg/NovatelHeading2": (
+        _definition(
+            f"{_NOVATEL_START}string solution_status; string position_type; float32 baseline_length; float32 heading; float32 pitch; "
+            "float32 heading_sigma; float32 pitch_sigma; string rover_station_id; string master_station_id; uint8 num_satellites_tracked; "
+            "uint8 num_satellites_used_in_solution; uint8 num_satellites_above_elevation_mask_angle; "
+            "uint8 num_satellites_above_elevation_mask_angle_l2; uint8 solution_source; "
+            "NovatelExtendedSolutionStatus extended_solution_status; NovatelSignalMask signal_mask",
+            **_NOVATEL, **_NOVATEL_EXTENDED, **_NOVATEL_SIGNALS,
+        ),
+    ),
+    "novatel_gps_msgs/msg/Inspvax": tuple(
+        _definition(
+            f"{_NOVATEL_START}string ins_status; string position_type; float64 latitude; float64 longitude; float64 altitude; "
+            f"float32 undulation; {_OEM7_INS}float32 latitude_std; float32 longitude_std; float32 altitude_std; float32 north_velocity_std; "
+            "float32 east_velocity_std; float32 up_velocity_std; float32 roll_std; float32 pitch_std; float32 azimuth_std; "
+            f"{next(iter(extended)).partition('__')[2]} extended_status; uint16 seconds_since_update",
+            **_NOVATEL, **extended,
+        )
+        for extended in (_NOVATEL_INS, _NOVATEL_EXTENDED)
+    ),
+    "novatel_gps_msgs/msg/Inspva": (
+        _definition(
+            f"{_NOVATEL_START}uint32 week; float64 seconds; float64 latitude; float64 longitude; float64 height; {_OEM7_INS}string status",
+            **_NOVATEL,
         ),
     ),
     "septentrio_gnss_driver/msg/INSNavGeod": (

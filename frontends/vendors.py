@@ -106,6 +106,12 @@ def gps_stamp_ns(tow_ms: int, log_ns: int) -> int:
     return since_ns + round((log_ns - since_ns) / _WEEK_NS) * _WEEK_NS
 
 
+def _week_stamp_ns(week: int, tow_ms: int, log_ns: int) -> int:
+    """Return the UTC of a GPS week and time of week; of a week that is none, as before a receiver knows it, that by the recording time."""
+    told_ns = _GPS_EPOCH_NS + week * _WEEK_NS + tow_ms * 1_000_000
+    return gps_stamp_ns(tow_ms, told_ns if told_ns >= NO_DATE_NS else log_ns)
+
+
 def _xyz(v: Any) -> tuple[float, float, float]:
     return float(v.x), float(v.y), float(v.z)
 
@@ -244,7 +250,8 @@ def _sbg_filtered_heading(msg: Any) -> SaidHeading | Rejection:
     return _filtered(_angle(degrees(yaw), degrees(float(msg.accuracy.z))))
 
 
-# u-blox: `ublox_msgs` with the manual's names of fields in ROS 1, in lower case in ROS 2, and `ublox_ubx_msgs` with flags of their own.
+# u-blox: `ublox_msgs` with the manual's names of fields in ROS 1, in lower case in ROS 2, `ublox_ubx_msgs` with flags of their own, and
+# `gnss_comm`, in units of ROS.
 
 _UBX_FIX_OK, _UBX_DIFFERENTIAL = 1, 2
 _UBX_TIME_VALID = 3
@@ -257,12 +264,14 @@ def _ubx_fix(msg: Any) -> tuple[int, bool]:
     """Type of fix, and whether it is good enough."""
     if hasattr(msg, "gps_fix"):
         return int(msg.gps_fix.fix_type), bool(msg.gnss_fix_ok) and not msg.invalid_llh
+    if hasattr(msg, "valid_fix"):
+        return int(msg.fix_type), bool(msg.valid_fix)
     return int(_any(msg, "fix_type", "fixType")), bool(msg.flags & _UBX_FIX_OK)
 
 
 def _ubx_status(msg: Any) -> int:
     if hasattr(msg, "carr_soln"):
-        return 2 if msg.carr_soln.status else int(msg.diff_soln)
+        return 2 if getattr(msg.carr_soln, "status", msg.carr_soln) else int(msg.diff_soln)
     return 2 if msg.flags >> 6 & 3 else int(bool(msg.flags & _UBX_DIFFERENTIAL))
 
 
@@ -288,6 +297,21 @@ def _ubx_velocity(msg: Any) -> SaidVelocity | Rejection:
     return SaidVelocity((east, north, -down), _known(sigma), _known(sigma))
 
 
+def _pvt_place(msg: Any) -> SaidPlace | Rejection:
+    if trouble := _ubx_trouble(msg):
+        return trouble
+    height = float("nan") if _ubx_fix(msg)[0] == _UBX_2D else float(msg.altitude)
+    place = float(msg.latitude), float(msg.longitude), height
+    return _place(place, _ubx_status(msg), float(msg.h_acc), float(msg.v_acc))
+
+
+def _pvt_velocity(msg: Any) -> SaidVelocity | Rejection:
+    if trouble := _ubx_trouble(msg):
+        return trouble
+    sigma = _known(float(msg.vel_acc))
+    return SaidVelocity((float(msg.vel_e), float(msg.vel_n), -float(msg.vel_d)), sigma, sigma)
+
+
 def _ubx_heading(msg: Any) -> SaidHeading | Rejection:
     if hasattr(msg, "is_moving"):
         moving, solution = bool(msg.is_moving), int(msg.carr_soln.status)
@@ -310,83 +334,120 @@ def _ubx_stamp_ns(msg: Any, log_ns: int) -> int:
     return gps_stamp_ns(int(_any(msg, "i_tow", "iTOW")), log_ns) if known else log_ns
 
 
-# NovAtel OEM7.
+def _pvt_stamp_ns(msg: Any, log_ns: int) -> int:
+    return _week_stamp_ns(int(msg.time.week), round(1000.0 * float(msg.time.tow)), log_ns)
 
-_OEM7_STATUS = {
+
+# NovAtel: `novatel_oem7_msgs`, whose statuses are messages of their own; `novatel_msgs`, where they are numbers, without a stamp of ROS;
+# `novatel_gps_msgs`, where they are the manual's words.
+
+_OEM7_STATUS: dict[int | str, int] = {
     **dict.fromkeys((16, 53, 70, 71, 72), 0), **dict.fromkeys((17, 18, 52, 54), 1),
     **dict.fromkeys((68, 69, 73, 74, 77, 78, 79, 80), 1),  # PPP
     **dict.fromkeys((32, 34, 48, 49, 50, 51, 55, 56), 2),
 }  # fmt: skip
-_OEM7_NONE = {0: "none", 1: "a position that was set, not measured", 19: "propagated without observations"}
+_OEM7_NONE: dict[int | str, str] = {
+    0: "none",
+    1: "a position that was set, not measured",
+    19: "propagated without observations",
+}
 _OEM7_FIXED = (48, 49, 50)
 _OEM7_INS = (51, 52, 53, 54, 55, 56, 73, 74, 79, 80)  # of a filter; of BESTPOS and BESTVEL too, where that is the best
-_INS_SETTLED = (3, 6, 7)
+_INS_SETTLED, _INS_LEAST = (3, 6, 7), 53
+_OEM7_WHERE = (("lat", "latitude"), ("lon", "longitude"), ("hgt", "height", "altitude"))
+_OEM7_WORDS = {
+    "SOL_COMPUTED": 0, "INS_SOLUTION_GOOD": 3, "INS_SOLUTION_FREE": 6, "INS_ALIGNMENT_COMPLETE": 7,
+    "NONE": 0, "FIXEDPOS": 1, "DOPPLER_VELOCITY": 8, "SINGLE": 16, "PSRDIFF": 17, "WAAS": 18, "PROPAGATED": 19, "PROPOGATED": 19,
+    "L1_FLOAT": 32, "NARROW_FLOAT": 34, "L1_INT": 48, "WIDE_INT": 49, "NARROW_INT": 50, "RTK_DIRECT_INS": 51, "INS_SBAS": 52,
+    "INS_PSRSP": 53, "INS_PSRDIFF": 54, "INS_RTKFLOAT": 55, "INS_RTKFIXED": 56, "PPP_CONVERGING": 68, "PPP": 69, "OPERATIONAL": 70,
+    "WARNING": 71, "OUT_OF_BOUNDS": 72, "INS_PPP_CONVERGING": 73, "INS_PPP": 74, "PPP_BASIC_CONVERGING": 77, "PPP_BASIC": 78,
+    "INS_PPP_BASIC_CONVERGING": 79, "INS_PPP_BASIC": 80,
+}  # fmt: skip
 
 
-def _oem7_trouble(msg: Any, solution: int, known: bool) -> Rejection | None:
-    status = int(msg.sol_status.status)
+def _oem7_code(msg: Any, *names: str) -> int | str:
+    """Return a status or a type of solution as the manual numbers it; a word that is none of those above as it stands."""
+    value = _any(msg, *names)
+    value = getattr(value, "status", getattr(value, "type", value))
+    if isinstance(value, str):
+        return _OEM7_WORDS.get(value, value)
+    if not isinstance(value, int):
+        raise TypeError(f"its {' or '.join(names)} is no number: the message is of another version")
+    return value
+
+
+def _oem7_type(msg: Any) -> int | str:
+    return _oem7_code(msg, "pos_type", "vel_type", "position_type", "velocity_type")
+
+
+def _oem7_trouble(msg: Any, solution: int | str, known: bool) -> Rejection | None:
+    status = _oem7_code(msg, "sol_status", "solution_status")
     if status == 0 and known:
         return None
     return rejected(f"no solution (status {status}, type {_OEM7_NONE.get(solution, solution)})")
 
 
 def _oem7_place(msg: Any) -> SaidPlace | Rejection:
-    solution = int(msg.pos_type.type)
+    solution = _oem7_type(msg)
     if trouble := _oem7_trouble(msg, solution, solution in _OEM7_STATUS):
         return trouble
-    place = float(msg.lat), float(msg.lon), float(msg.hgt) + float(msg.undulation)
-    horizontal = max(float(msg.lat_stdev), float(msg.lon_stdev))
-    return _filtered(_place(place, _OEM7_STATUS[solution], horizontal, float(msg.hgt_stdev)), solution in _OEM7_INS)
+    return _filtered(_oem7_where(msg, solution), solution in _OEM7_INS)
+
+
+def _oem7_where(msg: Any, solution: int | str) -> SaidPlace | Rejection:
+    # Heights of INSPVA are above the ellipsoid, and it has no undulation; all others are above the sea.
+    lat, lon, height = (float(_any(msg, *names)) for names in _OEM7_WHERE)
+    north, east, up = (_oem7_sigma(msg, *names) for names in _OEM7_WHERE)
+    place = lat, lon, height + float(getattr(msg, "undulation", 0.0))
+    return _place(place, _OEM7_STATUS[solution], max(north, east), up)
+
+
+def _oem7_sigma(msg: Any, *names: str) -> float:
+    """Return the sigma of a field; 0 where the message has none, as INSPVA."""
+    ends = [f"{name}_{end}" for name in names for end in ("stdev", "sigma", "std")]
+    return next((float(getattr(msg, name)) for name in ends if hasattr(msg, name)), 0.0)
 
 
 def _oem7_velocity(msg: Any) -> SaidVelocity | Rejection:
-    solution = int(msg.vel_type.type)
+    solution = _oem7_type(msg)
     if trouble := _oem7_trouble(msg, solution, solution not in _OEM7_NONE):
         return trouble
-    speed, track = float(msg.hor_speed), radians(float(msg.trk_gnd))
-    v = speed * sin(track), speed * cos(track), float(msg.ver_speed)
-    return SaidVelocity(v, filtered=solution in _OEM7_INS)
+    speed = float(_any(msg, "hor_speed", "hor_spd", "horizontal_speed"))
+    track = radians(float(_any(msg, "trk_gnd", "track_ground")))
+    up = float(_any(msg, "ver_speed", "vert_spd", "vertical_speed"))
+    return SaidVelocity((speed * sin(track), speed * cos(track), up), filtered=solution in _OEM7_INS)
 
 
 def _oem7_heading(msg: Any) -> SaidHeading | Rejection:
-    solution = int(msg.pos_type.type)
+    solution = _oem7_type(msg)
     if trouble := _oem7_trouble(msg, solution, solution not in _OEM7_NONE):
         return trouble
     if solution not in _OEM7_FIXED:
         return rejected(f"a heading with float ambiguities (type {solution})")
-    return _bearing(float(msg.heading), float(msg.heading_stdev))
+    return _bearing(float(msg.heading), _oem7_sigma(msg, "heading"))
+
+
+def _ins_type(msg: Any) -> int | str:
+    """Return the type of solution of an INSPVAX; of an INSPVA, which tells none, the least."""
+    return _oem7_type(msg) if hasattr(msg, "pos_type") or hasattr(msg, "position_type") else _INS_LEAST
 
 
 def _ins_trouble(msg: Any) -> Rejection | None:
     """Return why an INSPVAX, or an INSPVA, which holds less, is no solution."""
-    settled, solution = (
-        int(_any(msg, "ins_status", "status").status),
-        int(msg.pos_type.type) if hasattr(msg, "pos_type") else 0,
-    )
-    if settled in _INS_SETTLED and (solution in _OEM7_STATUS or not hasattr(msg, "pos_type")):
+    settled, solution = _oem7_code(msg, "ins_status", "status"), _ins_type(msg)
+    if settled in _INS_SETTLED and solution in _OEM7_STATUS:
         return None
     return rejected(f"no solution (ins_status {settled}, type {_OEM7_NONE.get(solution, solution)})")
 
 
-def _ins_sigmas(msg: Any, *names: str) -> tuple[float, ...]:
-    return tuple(_known(float(getattr(msg, f"{name}_stdev", 0.0))) for name in names)
-
-
 def _ins_place(msg: Any) -> SaidPlace | Rejection:
-    if trouble := _ins_trouble(msg):
-        return trouble
-    # Heights of INSPVAX are above the sea, those of INSPVA above the ellipsoid.
-    place = float(msg.latitude), float(msg.longitude), float(msg.height) + float(getattr(msg, "undulation", 0.0))
-    north, east, up = _ins_sigmas(msg, "latitude", "longitude", "height")
-    return _filtered(
-        _place(place, _OEM7_STATUS[int(msg.pos_type.type)] if hasattr(msg, "pos_type") else 0, max(north, east), up)
-    )
+    return _filtered(_ins_trouble(msg) or _oem7_where(msg, _ins_type(msg)))
 
 
 def _ins_velocity(msg: Any) -> SaidVelocity | Rejection:
     if trouble := _ins_trouble(msg):
         return trouble
-    north, east, up = _ins_sigmas(msg, "north_velocity", "east_velocity", "up_velocity")
+    north, east, up = (_known(_oem7_sigma(msg, f"{way}_velocity")) for way in ("north", "east", "up"))
     v = float(msg.east_velocity), float(msg.north_velocity), float(msg.up_velocity)
     return SaidVelocity(v, max(north, east), up, filtered=True)
 
@@ -394,13 +455,18 @@ def _ins_velocity(msg: Any) -> SaidVelocity | Rejection:
 def _ins_heading(msg: Any) -> SaidHeading | Rejection:
     if trouble := _ins_trouble(msg):
         return trouble
-    return _filtered(_bearing(float(msg.azimuth), _ins_sigmas(msg, "azimuth")[0]))
+    return _filtered(_bearing(float(msg.azimuth), _oem7_sigma(msg, "azimuth")))
 
 
-def _oem7_velocity_stamp_ns(msg: Any, log_ns: int) -> int | None:
-    """Return the header's stamp, less the age of the velocity."""
-    stamp_ns = int(msg.header.stamp.sec) * NS_PER_S + int(msg.header.stamp.nanosec)
-    age_s = float(msg.latency)
+def _oem7_stamp_ns(msg: Any, log_ns: int) -> int | None:
+    """Return the header's stamp, or in `novatel_msgs` its GPS time, less the age of a velocity."""
+    header = msg.header
+    if hasattr(header, "stamp"):
+        stamp_ns = int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec)
+    else:  # milliseconds, for all their names
+        tow_ms = _any(header, "gps_week_seconds", "gps_week_milliseconds", "gpssec")
+        stamp_ns = _week_stamp_ns(int(_any(header, "gps_week", "week")), int(tow_ms), log_ns)
+    age_s = float(getattr(msg, "latency", 0.0))
     stamp_ns -= round((age_s if 0.0 < age_s < 1.0 else 0.0) * NS_PER_S)
     return stamp_ns if stamp_ns > 0 else None
 
@@ -479,6 +545,20 @@ def _sbf_ins_velocity(msg: Any) -> SaidVelocity | Rejection:
 
 def _sbf_ins_heading(msg: Any) -> SaidHeading | Rejection:
     return _filtered(_sbf_ins_trouble(msg) or _angle(float(msg.heading), float(msg.heading_std_dev)))
+
+
+# The complex urban data set of KAIST: what its player makes of GGA and GST. Older messages have a dilution for the sigmas.
+
+_VRS_STATUS = {1: 0, 2: 1, 3: 0, 4: 2, 5: 2, 9: 1}  # of NavSatStatus, by quality of GGA
+
+
+def _vrs_place(msg: Any) -> SaidPlace | Rejection:
+    quality = int(msg.fix_state)
+    if quality not in _VRS_STATUS:
+        return rejected(f"no fix (fix_state {quality})")
+    north, east, up = (float(getattr(msg, f"{name}_std", 0.0)) for name in ("lat", "lon", "altitude"))
+    place = float(msg.latitude), float(msg.longitude), float(msg.altitude)
+    return _place(place, _VRS_STATUS[quality], max(north, east), up)
 
 
 # PX4: microseconds since boot, or of the computer's clock where its agent synchronises them.
@@ -589,6 +669,7 @@ def _geo_heading(msg: Any) -> SaidHeading | Rejection:
 
 GEOGRAPHIC = tuple(f"geographic_msgs/msg/{name}Stamped" for name in ("GeoPoint", "GeoPose", "GeoPoseWithCovariance"))
 _GPS = (Part("gnss", _px4_place), Part("gnss_velocity", _px4_velocity), Part("compass", _px4_heading))
+_NOVATEL = ("novatel_oem7_msgs", "novatel_msgs")
 VENDORS: dict[str, tuple[Part, ...]] = {
     "sbg_driver/msg/SbgImuData": (Part("imu", _sbg_imu),),
     "sbg_driver/msg/SbgImuShort": (Part("imu", _sbg_imu_short),),
@@ -605,16 +686,24 @@ VENDORS: dict[str, tuple[Part, ...]] = {
     **dict.fromkeys(
         ("ublox_msgs/msg/NavPVT", "ublox_msgs/msg/NavPVT7", "ublox_ubx_msgs/msg/UBXNavPVT"), (Part("gnss", _ubx_place), Part("gnss_velocity", _ubx_velocity)),
     ),
-    **dict.fromkeys(("ublox_msgs/msg/NavRELPOSNED9", "ublox_ubx_msgs/msg/UBXNavRelPosNED"), (Part("compass", _ubx_heading),)),
-    **dict.fromkeys(("novatel_oem7_msgs/msg/BESTPOS", "novatel_oem7_msgs/msg/BESTGNSSPOS"), (Part("gnss", _oem7_place),)),
     **dict.fromkeys(
-        ("novatel_oem7_msgs/msg/BESTVEL", "novatel_oem7_msgs/msg/BESTGNSSVEL"), (Part("gnss_velocity", _oem7_velocity),)
+        ("gnss_comm/msg/GnssPVTSolnMsg", "gnss_comm_msgs/msg/GnssPVTSolnMsg"), (Part("gnss", _pvt_place), Part("gnss_velocity", _pvt_velocity)),
     ),
-    "novatel_oem7_msgs/msg/HEADING2": (Part("compass", _oem7_heading),),
+    **dict.fromkeys(("ublox_msgs/msg/NavRELPOSNED9", "ublox_ubx_msgs/msg/UBXNavRelPosNED"), (Part("compass", _ubx_heading),)),
     **dict.fromkeys(
-        ("novatel_oem7_msgs/msg/INSPVAX", "novatel_oem7_msgs/msg/INSPVA"),
+        (*(f"{package}/msg/{name}" for package in _NOVATEL for name in ("BESTPOS", "BESTGNSSPOS")), "novatel_gps_msgs/msg/NovatelPosition"),
+        (Part("gnss", _oem7_place),),
+    ),
+    **dict.fromkeys(
+        (*(f"{package}/msg/{name}" for package in _NOVATEL for name in ("BESTVEL", "BESTGNSSVEL")), "novatel_gps_msgs/msg/NovatelVelocity"),
+        (Part("gnss_velocity", _oem7_velocity),),
+    ),
+    **dict.fromkeys(("novatel_oem7_msgs/msg/HEADING2", "novatel_gps_msgs/msg/NovatelHeading2"), (Part("compass", _oem7_heading),)),
+    **dict.fromkeys(
+        ("novatel_oem7_msgs/msg/INSPVAX", "novatel_oem7_msgs/msg/INSPVA", "novatel_msgs/msg/INSPVAX", "novatel_gps_msgs/msg/Inspvax", "novatel_gps_msgs/msg/Inspva"),
         (Part("gnss", _ins_place), Part("gnss_velocity", _ins_velocity), Part("compass", _ins_heading, antennas=False)),
     ),
+    "irp_sen_msgs/msg/vrs": (Part("gnss", _vrs_place),),
     "septentrio_gnss_driver/msg/INSNavGeod": (
         Part("gnss", _sbf_ins_place), Part("gnss_velocity", _sbf_ins_velocity),
         Part("compass", _sbf_ins_heading, told=False, antennas=False, usual="enu"),
@@ -633,6 +722,7 @@ VENDORS: dict[str, tuple[Part, ...]] = {
 STAMPS: dict[str, Callable[[Any, int], int | None]] = {
     **dict.fromkeys([t for t in VENDORS if t.startswith("ublox_msgs/")], _ubx_stamp_ns),
     **dict.fromkeys([t for t in VENDORS if t.startswith("px4_msgs/")], _px4_stamp_ns),
-    **dict.fromkeys([t for t in VENDORS if t.endswith("VEL")], _oem7_velocity_stamp_ns),
+    **dict.fromkeys([t for t in VENDORS if t.startswith("novatel_")], _oem7_stamp_ns),
+    **dict.fromkeys([t for t in VENDORS if t.startswith("gnss_comm")], _pvt_stamp_ns),
 }
 """Of types whose stamp is not that of a header: from message and recording time, ns."""

@@ -14,7 +14,7 @@ import pytest
 from rosbags.interfaces import Nodetype
 from scipy.spatial.transform import Rotation
 
-from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig, VesselConfig
+from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig, VesselConfig, load_config
 from graphloc.frames import wrap_angle
 from graphloc.frontends._assess import Courses
 from graphloc.frontends._assess_compass import compass_report
@@ -26,21 +26,25 @@ from graphloc.frontends._types import MessageTypes
 from graphloc.frontends._vendor_types import VENDOR_TYPES
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import DECODERS, QUATERNION, TWIST, ImuReading, stamp_ns_of
-from graphloc.frontends.inspect import inspect_bag
+from graphloc.frontends.inspect import draft_config, inspect_bag, render
 from graphloc.frontends.vendors import VENDORS
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.makers import said
+from tests.test_bag import KINDS
 from tests.test_inspect import drive, look
 
 ROS2 = Messages(2)
 CONFIGS: dict[str, Any] = {
     "imu": ImuConfig(), "gnss": GnssConfig(), "compass": CompassConfig(sigma_deg=7.0), "gnss_velocity": VelocityConfig(),
 }  # fmt: skip
-SBG, UBX, DGNSS, OEM7, SBF, PX4, GEO = (
+SBG, UBX, DGNSS, OEM7, SBF, PX4, GEO, COMM, SPAN, SWRI, KAIST = (
     f"{package}/msg/"
-    for package in ("sbg_driver", "ublox_msgs", "ublox_ubx_msgs", "novatel_oem7_msgs", "septentrio_gnss_driver", "px4_msgs", "geographic_msgs")
+    for package in (
+        "sbg_driver", "ublox_msgs", "ublox_ubx_msgs", "novatel_oem7_msgs", "septentrio_gnss_driver", "px4_msgs", "geographic_msgs",
+        "gnss_comm", "novatel_msgs", "novatel_gps_msgs", "irp_sen_msgs",
+    )
 )  # fmt: skip
 
 
@@ -86,6 +90,30 @@ PLACES: dict[str, dict[str, Any]] = {
     GEO + "GeoPoseWithCovarianceStamped": {
         "pose": {"pose": {"position": {"latitude": 57.5, "longitude": -11.25, "altitude": 41.5}}, "covariance": np.diag([0.0625, 0.25, 4, 0, 0, 0]).ravel()},
     },
+    COMM + "GnssPVTSolnMsg": {
+        "fix_type": 3, "valid_fix": True, "carr_soln": 2, "latitude": 57.5, "longitude": -11.25, "altitude": 41.5, "height_msl": 6.5,
+        "h_acc": 0.5, "v_acc": 2.0, "p_dop": 1.25,
+    },
+    SPAN + "BESTPOS": {
+        "position_type": 50, "latitude": 57.5, "longitude": -11.25, "altitude": 6.5, "undulation": 35.0,
+        "latitude_std": 0.5, "longitude_std": 0.25, "altitude_std": 2.0,
+    },
+    SPAN + "INSPVAX": {
+        "ins_status": 3, "position_type": 56, "latitude": 57.5, "longitude": -11.25, "altitude": 6.5, "undulation": 35.0,
+        "latitude_std": 0.25, "longitude_std": 0.5, "altitude_std": 2.0,
+    },
+    SWRI + "NovatelPosition": {
+        "solution_status": "SOL_COMPUTED", "position_type": "NARROW_INT", "lat": 57.5, "lon": -11.25, "height": 6.5, "undulation": 35.0,
+        "lat_sigma": 0.5, "lon_sigma": 0.25, "height_sigma": 2.0,
+    },
+    SWRI + "Inspvax": {
+        "ins_status": "INS_SOLUTION_GOOD", "position_type": "INS_RTKFIXED", "latitude": 57.5, "longitude": -11.25, "altitude": 6.5,
+        "undulation": 35.0, "latitude_std": 0.25, "longitude_std": 0.5, "altitude_std": 2.0,
+    },
+    KAIST + "vrs": {
+        "fix_state": 4, "latitude": 57.5, "longitude": -11.25, "altitude": 41.5, "horizental_precision": 9.0,
+        "lat_std": 0.25, "lon_std": 0.5, "altitude_std": 2.0,
+    },
     PX4 + "VehicleGpsPosition": {
         "fix_type": 6, "lat": 575_000_000, "lon": -112_500_000, "alt": 6_500, "alt_ellipsoid": 41_500, "eph": 0.5, "epv": 2.0,
     },
@@ -104,6 +132,21 @@ VELOCITIES: dict[str, tuple[dict[str, Any], float]] = {
     ),
     OEM7 + "INSPVA": ({"status": {"status": 7}, "north_velocity": 3.0, "east_velocity": -1.0, "up_velocity": -0.5}, 0.3),
     SBF + "INSNavGeod": ({"gnss_mode": 1, "vn": 3.0, "ve": -1.0, "vu": -0.5, "vn_std_dev": 0.25, "ve_std_dev": 0.125, "vu_std_dev": 0.25}, 0.25),
+    COMM + "GnssPVTSolnMsg": ({"fix_type": 3, "valid_fix": True, "vel_n": 3.0, "vel_e": -1.0, "vel_d": 0.5, "vel_acc": 0.25}, 0.25),
+    SPAN + "BESTVEL": ({"position_type": 8, "hor_spd": 10.0**0.5, "trk_gnd": 341.565051177078, "vert_spd": -0.5}, 0.3),
+    SPAN + "INSPVAX": (
+        {"ins_status": 7, "position_type": 56, "north_velocity": 3.0, "east_velocity": -1.0, "up_velocity": -0.5, "east_velocity_std": 0.25, "up_velocity_std": 0.25},
+        0.25,
+    ),
+    SWRI + "NovatelVelocity": (
+        {"solution_status": "SOL_COMPUTED", "velocity_type": "DOPPLER_VELOCITY", "horizontal_speed": 10.0**0.5, "track_ground": 341.565051177078, "vertical_speed": -0.5},
+        0.3,
+    ),
+    SWRI + "Inspvax": (
+        {"ins_status": "INS_ALIGNMENT_COMPLETE", "position_type": "INS_PSRSP", "north_velocity": 3.0, "east_velocity": -1.0, "up_velocity": -0.5, "north_velocity_std": 0.25, "up_velocity_std": 0.25},
+        0.25,
+    ),
+    SWRI + "Inspva": ({"status": "INS_SOLUTION_GOOD", "north_velocity": 3.0, "east_velocity": -1.0, "up_velocity": -0.5}, 0.3),
     PX4 + "SensorGps": ({"fix_type": 3, "vel_ned_valid": True, "vel_n_m_s": 3.0, "vel_e_m_s": -1.0, "vel_d_m_s": 0.5, "s_variance_m_s": 0.25}, 0.25),
 }  # fmt: skip
 WEST_BY_NORTH = Rotation.from_euler("ZYX", (150.0, 20.0, -10.0), degrees=True)  # in east, north, up
@@ -124,6 +167,10 @@ HEADINGS: dict[str, tuple[dict[str, Any], float]] = {
     SBF + "AttEuler": ({"mode": 2, "heading": 300.0}, 7.0),
     OEM7 + "INSPVAX": ({"ins_status": {"status": 6}, "pos_type": {"type": 53}, "azimuth": 300.0, "azimuth_stdev": 0.5}, 0.5),
     OEM7 + "INSPVA": ({"status": {"status": 3}, "azimuth": 300.0}, 7.0),
+    SPAN + "INSPVAX": ({"ins_status": 6, "position_type": 53, "azimuth": 300.0, "azimuth_std": 0.5}, 0.5),
+    SWRI + "NovatelHeading2": ({"solution_status": "SOL_COMPUTED", "position_type": "NARROW_INT", "heading": 300.0, "heading_sigma": 0.5}, 0.5),
+    SWRI + "Inspvax": ({"ins_status": "INS_SOLUTION_FREE", "position_type": "INS_PSRDIFF", "azimuth": 300.0, "azimuth_std": 0.5}, 0.5),
+    SWRI + "Inspva": ({"status": "INS_SOLUTION_GOOD", "azimuth": 300.0}, 7.0),
     SBF + "INSNavGeod": ({"gnss_mode": 1, "heading": 300.0, "heading_std_dev": 0.5}, 0.5),
     GEO + "GeoPoseStamped": ({"pose": {"orientation": ROS2.quat(WEST_BY_NORTH.as_quat().tolist())}}, 7.0),
     GEO + "GeoPoseWithCovarianceStamped": (
@@ -131,7 +178,7 @@ HEADINGS: dict[str, tuple[dict[str, Any], float]] = {
     ),
     PX4 + "SensorGps": ({"fix_type": 3, "heading": np.radians(-60.0), "heading_accuracy": np.radians(0.5)}, 0.5),
 }  # fmt: skip
-KNOWN_AXES = (UBX, DGNSS, OEM7, PX4, GEO)
+KNOWN_AXES = (UBX, DGNSS, OEM7, PX4, GEO, COMM, SPAN, SWRI)
 
 
 def read(kind: str, msgtype: str, fields: dict[str, Any], *, make: Messages = ROS2, **config: Any) -> Any:
@@ -154,6 +201,19 @@ def test_a_place_has_the_height_above_the_ellipsoid_and_the_sigma_of_an_axis(msg
 def test_a_place_without_an_accuracy_gets_the_default(msgtype: str) -> None:
     silent = {"position_accuracy": vector(0, 0, 0), "h_acc": 0, "v_acc": 0, "lat_stdev": 0.0, "lon_stdev": 0.0, "hgt_stdev": 0.0, "h_accuracy": 65535, "v_accuracy": 65535, "eph": np.nan, "epv": np.nan}  # fmt: skip
     silent |= dict.fromkeys(("latitude_stdev", "longitude_stdev", "height_stdev"), 0.0)
+    silent |= dict.fromkeys(
+        (
+            "latitude_std",
+            "longitude_std",
+            "altitude_std",
+            "lat_sigma",
+            "lon_sigma",
+            "height_sigma",
+            "lat_std",
+            "lon_std",
+        ),
+        0.0,
+    )
     silent |= dict.fromkeys(("latitude_std_dev", "longitude_std_dev", "height_std_dev"), -2e10)
     silent["pose"] = {"pose": PLACES[GEO + "GeoPoseWithCovarianceStamped"]["pose"]["pose"], "covariance": -np.ones(36)}
     fields = {name: silent.get(name, value) for name, value in PLACES[msgtype].items()}
@@ -255,6 +315,22 @@ INVALID: list[tuple[str, str, dict[str, Any], str]] = [
     ("compass", GEO + "GeoPoseStamped", {"pose": {}}, "no orientation"),
     ("compass", GEO + "GeoPoseStamped", {"pose": {"orientation": ROS2.quat((0, 0, 0.5, 0.5))}}, "unit quaternion"),
     ("gnss", GEO + "GeoPoseWithCovarianceStamped", {"pose": {"pose": {"position": {"latitude": np.nan}}}}, "NaN"),
+    ("gnss", COMM + "GnssPVTSolnMsg", {"valid_fix": False}, "gnssFixOK 0"),
+    ("gnss", COMM + "GnssPVTSolnMsg", {"h_acc": 4294967.295}, "by its accuracy"),
+    ("gnss_velocity", COMM + "GnssPVTSolnMsg", {"fix_type": 5}, "fix type 5"),
+    ("gnss", SPAN + "BESTPOS", {"solution_status": 1}, "status 1"),
+    ("gnss", SPAN + "BESTPOS", {"position_type": 1}, "set, not measured"),
+    ("gnss_velocity", SPAN + "BESTVEL", {"position_type": 0}, "type none"),
+    ("gnss", SPAN + "INSPVAX", {"ins_status": 2}, "ins_status 2"),
+    ("compass", SPAN + "INSPVAX", {"position_type": 0}, "type none"),
+    ("gnss", SWRI + "NovatelPosition", {"solution_status": "INSUFFICIENT_OBS"}, "status INSUFFICIENT_OBS, type 50"),
+    ("gnss", SWRI + "NovatelPosition", {"position_type": "NONE"}, "type none"),
+    ("gnss", SWRI + "NovatelPosition", {"position_type": "OMNISTAR"}, "type OMNISTAR"),
+    ("gnss_velocity", SWRI + "NovatelVelocity", {"velocity_type": "PROPOGATED"}, "propagated"),
+    ("compass", SWRI + "NovatelHeading2", {"position_type": "NARROW_FLOAT"}, "float"),
+    ("gnss", SWRI + "Inspvax", {"ins_status": "INS_ALIGNING"}, "ins_status INS_ALIGNING"),
+    ("gnss_velocity", SWRI + "Inspva", {"status": "WAITING_INITIALPOS"}, "ins_status WAITING_INITIALPOS"),
+    ("gnss", KAIST + "vrs", {"fix_state": 0}, "fix_state 0"),
 ]
 
 
@@ -275,6 +351,7 @@ def test_what_a_message_says_of_itself_is_believed(kind: str, msgtype: str, chan
         (DGNSS + "UBXNavPVT", {"gps_fix": {"fix_type": 2}}),
         (SBF + "PVTGeodetic", {"mode": 4 | 0x80}),
         (PX4 + "SensorGps", {"fix_type": 2}),
+        (COMM + "GnssPVTSolnMsg", {"fix_type": 2}),
     ],
 )
 def test_a_flat_fix_has_no_height(msgtype: str, flat: dict[str, Any]) -> None:
@@ -289,6 +366,10 @@ def test_a_flat_fix_has_no_height(msgtype: str, flat: dict[str, Any]) -> None:
         (DGNSS + "UBXNavPVT", {"carr_soln": {}}, 0), (DGNSS + "UBXNavPVT", {"carr_soln": {}, "diff_soln": True}, 1), (DGNSS + "UBXNavPVT", {}, 2),
         (OEM7 + "BESTPOS", {"pos_type": {"type": 16}}, 0), (OEM7 + "BESTPOS", {"pos_type": {"type": 18}}, 1), (OEM7 + "BESTPOS", {}, 2),
         (SBF + "PVTGeodetic", {"mode": 1}, 0), (SBF + "PVTGeodetic", {"mode": 6}, 1), (SBF + "PVTGeodetic", {"mode": 5}, 2),
+        (COMM + "GnssPVTSolnMsg", {"carr_soln": 0}, 0), (COMM + "GnssPVTSolnMsg", {"carr_soln": 0, "diff_soln": True}, 1), (COMM + "GnssPVTSolnMsg", {}, 2),
+        (SPAN + "BESTPOS", {"position_type": 16}, 0), (SPAN + "INSPVAX", {"position_type": 54}, 1), (SPAN + "BESTPOS", {}, 2),
+        (SWRI + "Inspvax", {"position_type": "INS_PSRSP"}, 0), (SWRI + "NovatelPosition", {"position_type": "WAAS"}, 1), (SWRI + "Inspvax", {}, 2),
+        (KAIST + "vrs", {"fix_state": 1}, 0), (KAIST + "vrs", {"fix_state": 2}, 1), (KAIST + "vrs", {}, 2),
         (PX4 + "SensorGps", {"fix_type": 3}, 0), (PX4 + "SensorGps", {"fix_type": 4}, 1), (PX4 + "SensorGps", {}, 2),
     ],
 )  # fmt: skip
@@ -343,6 +424,21 @@ def test_a_time_of_week_is_a_date_by_the_recording_time(at: int, leap_s: int, la
     assert stamp_ns_of(msg, UBX + "NavRELPOSNED9", at + round(late_s * S)) == at
 
 
+@pytest.mark.parametrize("log_ns", [START_NS, 40 * S], ids=["played again later", "no clock of the computer"])
+def test_a_gps_week_is_a_date_by_itself(log_ns: int) -> None:
+    """Week 2106 began at 2020-05-17 in GPS time; of week 0, as of a receiver without a clock, the recording time is all there is."""
+    at = utc_ns("2020-05-19T03:04:05") + S // 4
+    weeks_ms = 2 * 86_400_000 + of_gps(utc_ns("1980-01-06T03:04:05"), 18) + 250
+    pvt, pos, vel = COMM + "GnssPVTSolnMsg", SPAN + "BESTPOS", SPAN + "BESTVEL"
+    assert stamp_ns_of(said(ROS2, pvt, time={"week": 2106, "tow": weeks_ms / 1000.0}), pvt, log_ns) == at
+    header = {"gps_week": 2106, "gps_week_seconds": weeks_ms}
+    assert stamp_ns_of(said(ROS2, pos, header=header), pos, log_ns) == at
+    assert stamp_ns_of(said(ROS2, vel, header=header, latency=0.25), vel, log_ns) == at - S // 4
+    nothing = stamp_ns_of(said(ROS2, pos, header={"gps_week": 0, "gps_week_seconds": weeks_ms}), pos, log_ns)
+    assert nothing is not None
+    assert abs(nothing - log_ns) <= 302_400 * S
+
+
 def test_without_a_date_the_recording_time_is_taken() -> None:
     boot = 40 * S
     for valid, log_ns in ((7, boot), (1, START_NS)):  # no clock of the computer; none of the receiver
@@ -359,6 +455,8 @@ def test_stamps_of_px4_are_when_it_was_sampled_and_those_of_bestvel_lack_its_age
     vel = said(ROS2, OEM7 + "BESTVEL", header=ROS2.header(START_NS), latency=0.25)
     assert stamp_ns_of(vel, OEM7 + "BESTVEL", 7) == START_NS - S // 4
     assert stamp_ns_of(vel, OEM7 + "BESTVEL", 7, recorded=True) == 7
+    vel = said(ROS2, SWRI + "NovatelVelocity", header=ROS2.header(START_NS), latency=0.25)
+    assert stamp_ns_of(vel, SWRI + "NovatelVelocity", 7) == START_NS - S // 4
 
 
 def test_a_flag_that_older_versions_lack_changes_nothing() -> None:
@@ -389,7 +487,7 @@ def test_a_bag_without_definitions_is_read_in_each_version(msgtype: str, version
     make = Messages(2)
     fields = {
         "SbgGpsPos": PLACES[SBG + "SbgGpsPos"], "SensorGps": PLACES[PX4 + "SensorGps"] | {"heading": 0.5}, "SbgGpsHdt": {"true_heading": 300.0},
-        "SensorCombined": {"accelerometer_m_s2": (1, 2, 3)}, "SbgEkfEuler": {"angle": vector(0, 0, 1)},
+        "Inspvax": PLACES[SWRI + "Inspvax"], "SensorCombined": {"accelerometer_m_s2": (1, 2, 3)}, "SbgEkfEuler": {"angle": vector(0, 0, 1)},
         "DVL": {"velocity": vector(1, 2, 3), "fom": 0.25, "velocity_valid": True, "altitude": -1.0, "beams": [{"id": k} for k in range(4)], "form": "json_v3"},
     }.get(msgtype.split("/")[-1], {})  # fmt: skip
     if "int32 lat\n" in VENDOR_TYPES[msgtype][version] and fields:
@@ -581,6 +679,12 @@ def test_a_message_of_another_version_is_malformed_and_no_crash() -> None:
     with pytest.raises(AttributeError, match="another version"):
         found(SimpleNamespace(status=SimpleNamespace(vel_status=0, vel_type=1)), START_NS, 0, "it", VelocityConfig())
     assert stamp_ns_of(SimpleNamespace(), UBX + "NavPVT", 7) is None
+    letters, header = np.zeros(4, dtype=np.uint8), SimpleNamespace(week=2106, gpssec=1000)
+    older = SimpleNamespace(header=header, status=letters, pos_type=letters, latitude=57.5, longitude=-11.25, velx=1.0)
+    for part in VENDORS[SPAN + "INSPVAX"]:
+        with pytest.raises(TypeError, match="ins_status or status is no number: the message is of another version"):
+            part.read(older)
+    assert stamp_ns_of(older, SPAN + "INSPVAX", START_NS) == utc_ns("2020-05-16T23:59:43")
 
 
 def test_a_point_is_a_place_without_an_accuracy() -> None:
@@ -636,6 +740,55 @@ def test_a_filters_place_stands_behind_a_receivers(ins: bool, tmp_path: Path) ->
     topics = {sensor.topic for sensor in config.sensors.values()}
     assert topics >= {"/oem7/bestpos", "/oem7/bestgnsspos", "/oem7/bestvel"} | ({"/oem7/inspvax"} if ins else set())
     assert ("by its name, or its messages, a filter's output" in text) == ins
+
+
+def _urban(make: Messages, at: int, fix: Any, v: Any, heading_deg: float, ahead_s: int) -> list[Item]:
+    """A car with a receiver, and an inertial system as its reference; the computer's clock is ahead of UTC."""
+    since_ms = (at - ahead_s * S - utc_ns("1980-01-06")) // 1_000_000 + 18_000
+    week, tow_ms = divmod(since_ms, 604_800_000)
+    pvt = said(
+        make, COMM + "GnssPVTSolnMsg", time={"week": week, "tow": tow_ms / 1000.0}, fix_type=3, valid_fix=True, latitude=fix.latitude,
+        longitude=fix.longitude, altitude=fix.altitude, h_acc=1.2, v_acc=2.0, vel_n=v[1], vel_e=v[0], vel_d=-v[2], vel_acc=0.25,
+    )  # fmt: skip
+    header = {"gps_week": week, "gps_week_seconds": tow_ms}
+    place = {"position_type": 56, "latitude": fix.latitude, "longitude": fix.longitude, "altitude": fix.altitude, "latitude_std": 0.02, "longitude_std": 0.02, "altitude_std": 0.04}  # fmt: skip
+    ins = said(
+        make, SPAN + "INSPVAX", header=header, ins_status=3, north_velocity=v[1], east_velocity=v[0], up_velocity=v[2],
+        azimuth=heading_deg, azimuth_std=0.1, **place,
+    )  # fmt: skip
+    best = said(make, SPAN + "BESTPOS", header=header, **place)
+    return [
+        ("/ublox_driver/receiver_pvt", at, pvt),
+        ("/novatel_data/inspvax", at, ins),
+        ("/novatel_data/bestpos", at, best),
+    ]
+
+
+@pytest.mark.parametrize("ahead_s", [0, 18])
+def test_of_a_car_its_receiver_is_used_and_the_inertial_system_is_named_a_filter(ahead_s: int, tmp_path: Path) -> None:
+    make = Messages(1)
+    path = write_bag(tmp_path / "run.bag", make, _spoken(make, partial(_urban, ahead_s=ahead_s)), "ros1")
+    found = inspect_bag(path)
+    text = draft_config(found)
+    (tmp_path / "vessel.yaml").write_text(text)
+    config = load_config(tmp_path / "vessel.yaml", KINDS)
+    used = {(sensor.kind, sensor.topic) for sensor in config.sensors.values() if sensor.enabled}
+    assert used == {
+        ("imu", "/imu"), ("gnss", "/ublox_driver/receiver_pvt"), ("gnss_velocity", "/ublox_driver/receiver_pvt"),
+        ("compass", "/novatel_data/inspvax"),
+    }  # fmt: skip
+    assert text.count("by its name, or its messages, a filter's output") == 4  # two places, a velocity, a heading
+    assert "enabled: false where it is a reference to compare with" in text
+    assert "quality" not in text + render(found)  # of NMEA
+    offsets = [s.time_offset_s for s in config.sensors.values() if s.kind not in ("imu", "height")]
+    assert offsets == pytest.approx([float(ahead_s)] * len(offsets), abs=0.1)
+    assert ("18.0 s behind the IMU's, by the recording times: the IMU's is GPS time" in render(found)) == (ahead_s > 0)
+    recording = read_recording(path, config)
+    kinds = [type(m) for m in recording.measurements]
+    assert [kinds.count(kind) for kind in (GnssPosition, GnssVelocity, CompassHeading)] == [300] * 3
+    imu = recording.imu
+    assert imu is not None
+    assert abs(recording.measurements[0].stamp_ns - int(imu.stamps_ns[0])) < 0.1 * S
 
 
 def test_a_filters_place_alone_is_used_and_says_so(tmp_path: Path) -> None:
