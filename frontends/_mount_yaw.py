@@ -8,13 +8,13 @@ forward + i to port, by m = exp(i psi) a. So psi = arg sum(conj(a) m), and |sum|
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from graphloc.frames import Array
+from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import MeasuredMotion
 from graphloc.frontends._turning import Turning
 from graphloc.series import integral
@@ -34,12 +34,16 @@ _ASTRAY_DEG = 30.0  # leeway, or an antenna far ahead, make less
 
 @dataclass(frozen=True, slots=True)
 class YawInCraft:
-    """The turn from the craft's forward to the sensor's x, to port, deg; how clear it is, 0 to 1, and what chance makes."""
+    """The turn from the craft's forward to the sensor's x, to port, deg; how clear it is, 0 to 1, and what chance makes.
+
+    `differs_deg`: by how much other motions, or accelerations over other times, have it otherwise, where they are clear, too.
+    """
 
     source: str
     yaw_deg: float
     coherence: float
     chance: float
+    differs_deg: float = 0.0
 
     @property
     def clear(self) -> bool:
@@ -60,6 +64,11 @@ class YawInCraft:
     def sigma_deg(self) -> float:
         """1 sigma of the turn, of a phase of so many windows."""
         return float(np.degrees(self.chance * np.sqrt(0.5 * (1.0 - self.coherence**2)) / self.coherence))
+
+    @property
+    def error_deg(self) -> float:
+        """1 sigma of the turn, as a mount: waves last for many windows, and swing the antenna as well: windows of another length show it."""
+        return float(np.hypot(self.sigma_deg, self.differs_deg))
 
     @property
     def astray(self) -> bool:
@@ -128,7 +137,11 @@ def yaw_in_craft(
     """
     felt = Felt.of(stamps_ns, accel, gyro)
     tried = [found for motion in motions for half_s in windows_of(motion) if (found := _yaw_by(felt, motion, half_s))]
-    return max(tried, key=lambda found: found.coherence / found.chance, default=None)
+    if not tried:
+        return None
+    best = max(tried, key=lambda found: found.coherence / found.chance)
+    others = np.radians([found.yaw_deg - best.yaw_deg for found in tried if found.clear])
+    return replace(best, differs_deg=float(np.degrees(np.abs(wrap_angle(others)).max(initial=0.0))))
 
 
 def windows_of(motion: MeasuredMotion) -> tuple[float, ...]:

@@ -88,7 +88,8 @@ class TopicReport:
 class MountGuess:
     """Rotation of a sensor in body, deg, or the frame of tf that knows it; and the evidence.
 
-    `xyz_m`: its place, where known. `yaw_told`: whether anything tells its yaw.
+    `xyz_m`: its place, where known. `yaw_told`: whether anything tells its yaw. `yaw_sigma_deg`: how well, 1 sigma, where it is not a
+    quarter turn; else None.
     """
 
     rpy_deg: Vec
@@ -96,6 +97,7 @@ class MountGuess:
     evidence: str
     xyz_m: Vec | None = None
     yaw_told: bool = True
+    yaw_sigma_deg: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
