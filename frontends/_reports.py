@@ -266,7 +266,8 @@ class VelocityReport:
     """A velocity topic: the axes that fit the GNSS track ('unknown': none does; None: nothing to judge by), and why; `late_s` as of a receiver.
 
     `reverse`: it says astern throughout, which is taken for a wrong sign. `mount`: of one whose own axes are known by its type.
-    `sideways`: a log's that tells its speed to the side, too.
+    `sideways`: a log's, or that of one which sits turned, that tells its speed to the side, too. `rpy_deg`: how its axes sit by tf, where the
+    track does not deny it.
     """
 
     topic: str
@@ -278,6 +279,7 @@ class VelocityReport:
     reverse: bool = False
     mount: MountGuess | None = None
     sideways: bool = False
+    rpy_deg: Vec | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
