@@ -29,6 +29,8 @@ _LIKELY_COHERENCE, _LIKELY = 0.5, 3.0  # the same, to choose between quarter tur
 _HINT = 2.0  # the same, to leave a sensor where it is: chance gives it once in 200
 _WAVES_S = 20.0  # the longest that tilt it
 _NEARLY = 0.9  # as long as from one measurement to the next, whose stamps may be uneven
+_AS_COHERENT = 0.9  # at least as the best, nearly: others are full of waves
+_DIFFERS_DEG = 22.5  # of two that are as far off to either side, one is nearer to another quarter turn
 _ASTRAY_DEG = 30.0  # leeway, or an antenna far ahead, make less
 
 
@@ -36,7 +38,7 @@ _ASTRAY_DEG = 30.0  # leeway, or an antenna far ahead, make less
 class YawInCraft:
     """The turn from the craft's forward to the sensor's x, to port, deg; how clear it is, 0 to 1, and what chance makes.
 
-    `differs_deg`: by how much other motions, or accelerations over other times, have it otherwise, where they are clear, too.
+    `differs_deg`: by how much other motions, or accelerations over other times, have it otherwise, where they are as coherent.
     """
 
     source: str
@@ -46,14 +48,19 @@ class YawInCraft:
     differs_deg: float = 0.0
 
     @property
+    def agrees(self) -> bool:
+        """Whether the others have it alike, nearly: of a craft that often goes sideways they do not, and its courses tell no quarter turn."""
+        return self.differs_deg < _DIFFERS_DEG
+
+    @property
     def clear(self) -> bool:
         """Whether chance would not have it."""
-        return self.coherence >= max(_MIN_COHERENCE, _CLEAR * self.chance)
+        return self.agrees and self.coherence >= max(_MIN_COHERENCE, _CLEAR * self.chance)
 
     @property
     def likely(self) -> bool:
         """Whether it tells which quarter turn is the likeliest."""
-        return self.coherence >= max(_LIKELY_COHERENCE, _LIKELY * self.chance)
+        return self.agrees and self.coherence >= max(_LIKELY_COHERENCE, _LIKELY * self.chance)
 
     @property
     def hints(self) -> bool:
@@ -140,7 +147,8 @@ def yaw_in_craft(
     if not tried:
         return None
     best = max(tried, key=lambda found: found.coherence / found.chance)
-    others = np.radians([found.yaw_deg - best.yaw_deg for found in tried if found.clear])
+    as_coherent = [found for found in tried if found.clear and found.coherence > _AS_COHERENT * best.coherence]
+    others = np.radians([found.yaw_deg - best.yaw_deg for found in as_coherent])
     return replace(best, differs_deg=float(np.degrees(np.abs(wrap_angle(others)).max(initial=0.0))))
 
 
