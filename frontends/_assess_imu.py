@@ -132,7 +132,7 @@ def _turned(
     imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion], level: Array, said: str
 ) -> MountGuess:
     """Return the mount of a sensor that `level` (3, 3) levels, aligned with the motion; `said`: why it is known."""
-    yaw, evidence = _mount_yaw(imu, accel @ level.T, gyro @ level.T, motions)
+    yaw, sigma, evidence = _mount_yaw(imu, accel @ level.T, gyro @ level.T, motions)
     told = yaw is not None
     if yaw is None:
         ahead = level[:, 2] if level[2, 1] < _CAMERA else np.array([1.0, 0.0, 0.0])
@@ -140,7 +140,7 @@ def _turned(
         evidence += f": taken as {yaw:.0f}" + ("" if yaw == 0.0 else ", z ahead and y down as in a camera's axes")
     turn = Rotation.from_euler("z", yaw, degrees=True).as_matrix()
     rpy = vec(np.round(np.degrees(rpy_from_rotation(turn @ level)), 1) + 0.0)
-    return MountGuess(rpy_deg=rpy, tf_frame=None, evidence=f"{said}; {evidence}", yaw_told=told)
+    return MountGuess(rpy_deg=rpy, tf_frame=None, evidence=f"{said}; {evidence}", yaw_told=told, yaw_sigma_deg=sigma)
 
 
 def turned_as_its_heading(imu: ImuReport, compasses: Sequence[CompassReport]) -> ImuReport:
@@ -180,24 +180,24 @@ def _level(axis: Array) -> Array:
 
 def _mount_yaw(
     imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion]
-) -> tuple[float | None, str]:
-    """Return the yaw (deg) that fits the motion, None where nothing tells it, with the evidence; `accel`, `gyro` are levelled.
+) -> tuple[float | None, float | None, str]:
+    """Return the yaw (deg) that fits the motion, None where nothing tells it, and the evidence; `accel`, `gyro` are levelled.
 
-    It is a multiple of 90 deg unless the motion clearly contradicts that.
+    It is a multiple of 90 deg unless the motion clearly contradicts that: then 1 sigma of it, deg, comes with it, else None.
     """
     if not motions:
-        return None, "no motion to find its yaw from"
+        return None, None, "no motion to find its yaw from"
     found = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], accel, gyro, motions)
     if found is None:
-        return None, "too little motion to find its yaw from"
+        return None, None, "too little motion to find its yaw from"
     quarter = 90.0 * round(found.yaw_deg / 90.0)
     stays = found.hints and abs(found.yaw_deg) < _AHEAD_DEG
     if not found.clear and (found.likely or stays):
         yaw = float(np.degrees(wrap_angle(np.radians(quarter)))) + 0.0 if found.likely else 0.0
         said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg, but not clearly (coherence {found.coherence:.2f})"
-        return yaw, f"{said}: taken as {yaw:.0f}"
+        return yaw, None, f"{said}: taken as {yaw:.0f}"
     if not found.clear:
-        return None, f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
+        return None, None, f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
     askew = abs(found.yaw_deg - quarter) > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
     yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter)))) + 0.0
     said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"
@@ -207,7 +207,7 @@ def _mount_yaw(
             f", taken as {yaw:.0f}, since leeway makes a few degrees: on wheels set {found.yaw_deg:.0f}, or the heading is off by "
             f"{off_deg:.0f} deg, which no bound includes"
         )
-    return yaw, said
+    return yaw, found.error_deg if askew else None, said
 
 
 def turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Turning:

@@ -41,11 +41,16 @@ _OF_LOG = re.compile(r"dvl|doppler|wheel|speed_?log", re.IGNORECASE)
 _FEWEST = 20
 _FAR_WORSE = 5.0  # times the sigma that most fixes claim
 _ASTERN, _MOVES_MPS = 0.95, 0.3
+_ALONG = 0.9  # of its x along that of the body: a log that is turned by more tells the speed ahead by its y, too
 _REVERSED = "it goes astern nearly all the time: its sign looks wrong, and is taken for reversed"
 
 
 def axes_of(
-    stream: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float = 0.0
+    stream: TopicData,
+    stamps_ns: NDArray[np.int64],
+    p_m: Array,
+    scatter_m: float = 0.0,
+    R_body_sensor: Array | None = None,
 ) -> tuple[str | None, str]:
     """Return the axes in which the velocities of a stream fit chords of a track, and the evidence in words.
 
@@ -53,18 +58,19 @@ def axes_of(
 
     Args:
         stream: velocities in its last three columns. stamps_ns: (N,) of the track. p_m: (N, 3) the track, east, north, up.
-        scatter_m: noise of its positions, 1 sigma of an axis.
+        scatter_m: noise of its positions, 1 sigma of an axis. R_body_sensor: (3, 3), where its axes are turned in the body.
     """
-    axes, why = _axes_by(stream, stamps_ns, p_m, scatter_m, _CHORD_S)
+    R = np.eye(3) if R_body_sensor is None else R_body_sensor
+    axes, why = _axes_by(stream, stamps_ns, p_m, scatter_m, _CHORD_S, R)
     if axes == "unknown":
-        over, why_over = _axes_by(stream, stamps_ns, p_m, scatter_m, _LONG_CHORD_S)
+        over, why_over = _axes_by(stream, stamps_ns, p_m, scatter_m, _LONG_CHORD_S, R)
         if over in (EAST_AXES, NORTH_AXES):
             return over, f"{why_over}, over {_LONG_CHORD_S:.0f} s: the fixes wander"
     return axes, why
 
 
 def _axes_by(
-    stream: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float, chord_s: float
+    stream: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float, chord_s: float, R_body_sensor: Array
 ) -> tuple[str | None, str]:
     """Return the same by chords of one length."""
     keep = sane(stream, np.s_[-3:])
@@ -73,12 +79,13 @@ def _axes_by(
     noise = 2.0 * scatter_m / chord_s  # of a chord between two places, both axes together, m/s
     forward = chords / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
     # Body x laid along the track, either way: a craft may go astern.
-    along = forward * np.abs(mean[:, :1])
+    in_body = mean @ R_body_sensor.T
+    along = forward * np.abs(in_body[:, :1])
     squared = np.array([((v - chords) ** 2).sum(axis=1) for v in (mean[:, :2], mean[:, 1::-1], along)])
     # Where the fixes jump, none fits; a few such chords would hide all the others.
     least = squared.min(axis=0)
     kept = least <= np.quantile(least, 1.0 - _JUMP) if len(least) else np.zeros(0, dtype=bool)
-    chords, mean, squared = chords[kept], mean[kept], squared[:, kept]
+    chords, in_body, squared = chords[kept], in_body[kept], squared[:, kept]
     speed = _less(float(np.sqrt((chords**2).sum(axis=1).mean())), noise) if len(chords) else 0.0
     if len(chords) < 10 or speed < 0.5:
         return None, "no GNSS track in motion to check it against"
@@ -89,7 +96,7 @@ def _axes_by(
     errors = [_less(float(np.sqrt(own.mean())), part * noise) for own, part in zip(squared, parts, strict=True)]
     best = int(np.argmin(errors))
     if _AXES[best] == BODY_AXES and errors[0] < _FITS * speed:
-        own = _east_or_ahead(chords, mean)
+        own = _east_or_ahead(chords, in_body)
         if own is None:
             said = "the craft goes east or west throughout, where a speed ahead looks like a velocity to the east"
             return EITHER, f"{said}: either differs by {errors[0]:.2f} m/s RMS from the GNSS track beyond its noise"
@@ -127,8 +134,12 @@ def velocity_report(
     Args:
         stream, stamps_ns, p_m, scatter_m: as for `axes_of`. pose: T_body_sensor by tf, which connects its frame with the body.
     """
-    axes, why = axes_of(stream, stamps_ns, p_m, scatter_m)
     log = stream.part is not None and stream.part.kind == "body_velocity"
+    R_body_sensor = None if log or pose is None else pose[1]
+    axes, why = axes_of(stream, stamps_ns, p_m, scatter_m, R_body_sensor)
+    if axes == "unknown" and R_body_sensor is not None:  # of axes that are not those of tf
+        R_body_sensor = None
+        axes, why = axes_of(stream, stamps_ns, p_m, scatter_m)
     if log:
         axes, why = BODY_AXES, f"a Doppler log's, by its type; {why}"
     elif stream.part is not None and stream.part.told:
@@ -143,6 +154,7 @@ def velocity_report(
     if of_log(stream.topic) or through_water(stream.topic):
         past = "through the water" if through_water(stream.topic) else "over ground by a log"
         axes, why = BODY_AXES, f"a speed {past}; {why}"
+    turned = axes == BODY_AXES and R_body_sensor is not None and abs(float(R_body_sensor[0, 0])) < _ALONG
     rows = stream.rows[sane(stream)]
     reverse = axes == BODY_AXES and pose is None and len(rows) > 0 and _astern(rows[:, -3])
     return VelocityReport(
@@ -153,7 +165,10 @@ def velocity_report(
         tf_frame=None if pose is None else stream.frame_id,
         reverse=reverse,
         mount=_mount_of_log(stream.frame_id, pose, reverse) if log else None,
-        sideways=of_log(stream.topic) and bool(np.nan_to_num(rows[:, -2]).any()),
+        sideways=(of_log(stream.topic) or turned) and bool(np.nan_to_num(rows[:, -2]).any()),
+        rpy_deg=vec(np.degrees(rpy_from_rotation(R_body_sensor)))
+        if axes == BODY_AXES and R_body_sensor is not None
+        else None,
     )
 
 
@@ -254,9 +269,9 @@ def motions_of(
         ):
             continue
         log = report.mount if report.tf_frame is not None else None
-        motion = _told(
-            stream, report.axes or EAST_AXES, None if log is None else rotation_from_rpy_deg(np.array(log.rpy_deg))
-        )
+        rpy_deg = report.rpy_deg if log is None else log.rpy_deg
+        R = None if rpy_deg is None else rotation_from_rpy_deg(np.array(rpy_deg))
+        motion = _told(stream, report.axes or EAST_AXES, R)
         if motion is not None and float(np.percentile(np.abs(motion.speed_mps), 90)) > 0.5:
             (found if report.mount is None or log is not None else logs).append(motion)
     ways = [(s, *_as_good_as_most(*track(s))) for s in fixes]

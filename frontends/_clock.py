@@ -112,6 +112,11 @@ class ClockStep(NamedTuple):
         return f"{said}: no time_offset_s holds on both sides, and no bound includes it; take one side (--start, --duration)"
 
     @property
+    def when(self) -> str:
+        """Return when it was, in words."""
+        return f"all of it at {utc_text(self.at_ns)}, recording time"
+
+    @property
     def said_of_recorder(self) -> str:
         """Return it in words, of the clock that makes the recording times."""
         return (
@@ -120,10 +125,14 @@ class ClockStep(NamedTuple):
         )
 
 
-def step(stamps_ns: Stamps, logs_ns: Stamps) -> ClockStep | None:
-    """Return the one step in which a clock gains all that it gains on the recording times; None where it gains otherwise, or hardly."""
+def step(stamps_ns: Stamps, logs_ns: Stamps, least_s: float = EPOCH_LIMIT_S) -> ClockStep | None:
+    """Return the one step in which a clock gains all that it gains on the recording times; None where it gains otherwise, or hardly.
+
+    Args:
+        least_s: smallest one. By less than the default messages may be delayed as well, from some time on.
+    """
     gained_s = gain(stamps_ns, logs_ns).gained_s
-    if abs(gained_s) < EPOCH_LIMIT_S:  # messages are delayed by less
+    if abs(gained_s) < least_s:
         return None
     ahead_s = (stamps_ns - logs_ns) / NS_PER_S * np.sign(gained_s)
     part = max(len(ahead_s) // _TENTHS, 1)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import count
@@ -262,6 +263,7 @@ def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
     if imu.gravity != "included":
         lines.append(f"  gravity: {imu.gravity}  # guess: {reason}")
     lines.append(_mount_line(imu.mount))
+    lines += _mount_sigma_lines(imu.mount)
     lines += _noise_lines(imu)
     return lines
 
@@ -273,6 +275,17 @@ def _mount_line(mount: MountGuess) -> str:
     xyz = ", ".join(f"{a:.3f}" for a in mount.xyz_m) if mount.xyz_m else "0.0, 0.0, 0.0"
     whose = "xyz as there" if mount.xyz_m else "xyz unknown"
     return f"  mount: {{xyz_m: [{xyz}], rpy_deg: [{rpy}]}}  # guess: {mount.evidence}; {whose}"
+
+
+def _mount_sigma_lines(mount: MountGuess) -> list[str]:
+    """A yaw that is no quarter turn is known as well as the motion tells it, which is often worse than the default allows for."""
+    default = ImuConfig().mount_sigma_deg
+    if mount.tf_frame is not None or mount.yaw_sigma_deg is None:
+        return []
+    sigma = math.hypot(default, mount.yaw_sigma_deg)
+    return [
+        f"  mount_sigma_deg: {sigma:.1f}  # guess: as well as the motion tells that yaw; {default:g} once it is measured"
+    ]
 
 
 def _noise_lines(imu: ImuReport) -> list[str]:

@@ -8,13 +8,13 @@ forward + i to port, by m = exp(i psi) a. So psi = arg sum(conj(a) m), and |sum|
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from graphloc.frames import Array
+from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import MeasuredMotion
 from graphloc.frontends._turning import Turning
 from graphloc.series import integral
@@ -29,27 +29,38 @@ _LIKELY_COHERENCE, _LIKELY = 0.5, 3.0  # the same, to choose between quarter tur
 _HINT = 2.0  # the same, to leave a sensor where it is: chance gives it once in 200
 _WAVES_S = 20.0  # the longest that tilt it
 _NEARLY = 0.9  # as long as from one measurement to the next, whose stamps may be uneven
+_AS_COHERENT = 0.9  # at least as the best, nearly: others are full of waves
+_DIFFERS_DEG = 22.5  # of two that are as far off to either side, one is nearer to another quarter turn
 _ASTRAY_DEG = 30.0  # leeway, or an antenna far ahead, make less
 
 
 @dataclass(frozen=True, slots=True)
 class YawInCraft:
-    """The turn from the craft's forward to the sensor's x, to port, deg; how clear it is, 0 to 1, and what chance makes."""
+    """The turn from the craft's forward to the sensor's x, to port, deg; how clear it is, 0 to 1, and what chance makes.
+
+    `differs_deg`: by how much other motions, or accelerations over other times, have it otherwise, where they are as coherent.
+    """
 
     source: str
     yaw_deg: float
     coherence: float
     chance: float
+    differs_deg: float = 0.0
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the others have it alike, nearly: of a craft that often goes sideways they do not, and its courses tell no quarter turn."""
+        return self.differs_deg < _DIFFERS_DEG
 
     @property
     def clear(self) -> bool:
         """Whether chance would not have it."""
-        return self.coherence >= max(_MIN_COHERENCE, _CLEAR * self.chance)
+        return self.agrees and self.coherence >= max(_MIN_COHERENCE, _CLEAR * self.chance)
 
     @property
     def likely(self) -> bool:
         """Whether it tells which quarter turn is the likeliest."""
-        return self.coherence >= max(_LIKELY_COHERENCE, _LIKELY * self.chance)
+        return self.agrees and self.coherence >= max(_LIKELY_COHERENCE, _LIKELY * self.chance)
 
     @property
     def hints(self) -> bool:
@@ -60,6 +71,11 @@ class YawInCraft:
     def sigma_deg(self) -> float:
         """1 sigma of the turn, of a phase of so many windows."""
         return float(np.degrees(self.chance * np.sqrt(0.5 * (1.0 - self.coherence**2)) / self.coherence))
+
+    @property
+    def error_deg(self) -> float:
+        """1 sigma of the turn, as a mount: waves last for many windows, and swing the antenna as well: windows of another length show it."""
+        return float(np.hypot(self.sigma_deg, self.differs_deg))
 
     @property
     def astray(self) -> bool:
@@ -128,7 +144,12 @@ def yaw_in_craft(
     """
     felt = Felt.of(stamps_ns, accel, gyro)
     tried = [found for motion in motions for half_s in windows_of(motion) if (found := _yaw_by(felt, motion, half_s))]
-    return max(tried, key=lambda found: found.coherence / found.chance, default=None)
+    if not tried:
+        return None
+    best = max(tried, key=lambda found: found.coherence / found.chance)
+    as_coherent = [found for found in tried if found.clear and found.coherence > _AS_COHERENT * best.coherence]
+    others = np.radians([found.yaw_deg - best.yaw_deg for found in as_coherent])
+    return replace(best, differs_deg=float(np.degrees(np.abs(wrap_angle(others)).max(initial=0.0))))
 
 
 def windows_of(motion: MeasuredMotion) -> tuple[float, ...]:

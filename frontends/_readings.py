@@ -155,21 +155,22 @@ def _drop(readings: Readings, bad: NDArray[np.bool_], rejection: Rejection, warn
     return rows
 
 
-def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
+def clock_warnings(sensors: Sequence[Readings]) -> tuple[list[str], tuple[str, ...]]:
     """Return a line for each sensor whose clock differs from that of the IMU (or, without one, of the first sensor).
 
-    Where a clock was set during the run, a line on that instead, for all whom it concerns: if it is the IMU's, all others.
+    Where a clock was set during the run, a line on that instead, for all whom it concerns: if it is the IMU's, all others. And of these lines
+    those that make all poses doubtful, as no bound includes what they say.
     """
     told = [r for r in sensors if r.stamps_ns]
     if len(told) < 2:
-        return []
+        return [], ()
     reference = next((r for r in told if r.config.kind == "imu"), told[0])
     logs = {r.sensor: _clock.steady_logs(r.stamps(), r.logs()) for r in told}
     gains = {r.sensor: _clock.gain(r.stamps(), logs[r.sensor]) for r in told}
     usual, usual_s = gains[reference.sensor], _clock.usual_latency_s(reference.stamps(), logs[reference.sensor])
     steps = {r.sensor: _clock.step(r.stamps(), logs[r.sensor]) for r in told}
     stepped: dict[str, list[str]] = {}
-    lines = []
+    lines, doubts = list[str](), list[str]()
     if (recorder := _clock.recorder_set(reference.stamps(), reference.logs())) is not None:
         lines.append(recorder.said_of_recorder)
     for r in told:
@@ -190,13 +191,26 @@ def clock_warnings(sensors: Sequence[Readings]) -> list[str]:
             )
         if abs(gain_s) > _clock.GAIN_LIMIT_S:
             cure = "synchronise the clocks, or smooth short parts (--start, --duration)"
-            if own.even and usual.even and drift_ppm:
+            when = next(
+                (
+                    at.when
+                    for s in (r, reference)
+                    if (at := _clock.step(s.stamps(), logs[s.sensor], _clock.GAIN_LIMIT_S))
+                ),
+                "",
+            )
+            if when:
+                when, cure = f", {when}", "take one side (--start, --duration), or synchronise the clocks"
+            elif own.even and usual.even and drift_ppm:
                 cure = f"set its clock_drift_ppm to {r.config.clock_drift_ppm + drift_ppm:.1f}"
             lines.append(
                 f"{r.sensor}: its clock {'gains' if gain_s > 0 else 'loses'} {abs(gain_s):.2f} s on that of {reference.sensor} "
-                f"during the run, by the recording times: no time_offset_s holds throughout, and no bound includes it; {cure}"
+                f"during the run, by the recording times{when}: no time_offset_s holds throughout, and no bound includes it; {cure}"
             )
-    return [*(f"{', '.join(names)}: {said}" for said, names in stepped.items()), *lines]
+            if abs(gain_s) > max(_clock.SCANS_AHEAD_S, 2.0 * getattr(r.config, "stamp_sigma_s", 0.0)):
+                doubts.append(lines[-1])
+    set_lines = [f"{', '.join(names)}: {said}" for said, names in stepped.items()]
+    return [*set_lines, *lines], (*set_lines, *doubts)
 
 
 def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | None, list[LedgerRow]]:

@@ -93,7 +93,8 @@ class TopicReport:
 class MountGuess:
     """Rotation of a sensor in body, deg, or the frame of tf that knows it; and the evidence.
 
-    `xyz_m`: its place, where known. `yaw_told`: whether anything tells its yaw.
+    `xyz_m`: its place, where known. `yaw_told`: whether anything tells its yaw. `yaw_sigma_deg`: how well, 1 sigma, where it is not a
+    quarter turn; else None.
     """
 
     rpy_deg: Vec
@@ -101,6 +102,7 @@ class MountGuess:
     evidence: str
     xyz_m: Vec | None = None
     yaw_told: bool = True
+    yaw_sigma_deg: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -269,7 +271,8 @@ class VelocityReport:
     """A velocity topic: the axes that fit the GNSS track ('unknown': none does; None: nothing to judge by), and why; `late_s` as of a receiver.
 
     `reverse`: it says astern throughout, which is taken for a wrong sign. `mount`: of one whose own axes are known by its type.
-    `sideways`: a log's that tells its speed to the side, too.
+    `sideways`: a log's, or that of one which sits turned, that tells its speed to the side, too. `rpy_deg`: how its axes sit by tf, where the
+    track does not deny it.
     """
 
     topic: str
@@ -281,6 +284,7 @@ class VelocityReport:
     reverse: bool = False
     mount: MountGuess | None = None
     sideways: bool = False
+    rpy_deg: Vec | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

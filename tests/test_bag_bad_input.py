@@ -22,6 +22,7 @@ from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, PoseFix
 from graphloc.recording import Recording
+from graphloc.time import utc_text
 from tests.bagfactory import START_NS, Item, Messages, S, damage_last_chunk, rows_of, still_run, write_bag
 from tests.test_bag import accounted, vessel
 
@@ -513,6 +514,28 @@ def test_a_recorder_whose_clock_is_set_loses_nothing(share: float, tmp_path: Pat
     assert sum("the recorder's clock was set by +3600 s" in w for w in found.warnings) == 1
     assert [abs(t.latency_s[0]) < 0.1 for t in found.topics if t.latency_s] == [True, True]
     assert "time_offset_s" not in draft_config(found)
+
+
+@pytest.mark.parametrize(("by_s", "sigma_s", "doubted"), [(0.4, 0.05, True), (0.4, 0.25, False), (0.12, 0.05, False)])
+def test_a_clock_that_ntp_sets_by_less_than_a_second_leaves_no_pose_good(
+    by_s: float, sigma_s: float, doubted: bool, tmp_path: Path
+) -> None:
+    """It stamps and records the IMU's samples; the receiver has a clock of its own. All was called good, 1 m off at 4 m/s, and when was not said."""
+    set_ns = START_NS + 20 * S
+    items = [
+        (
+            topic,
+            at + int(by_s * S) * (at >= set_ns),
+            MAKE.imu(at + int(by_s * S)) if topic == "/imu" and at >= set_ns else m,
+        )
+        for topic, at, m in still_run(MAKE, seconds=40.0)
+    ]
+    recording = read(tmp_path, items, gnss={"topic": "/fix", "stamp_sigma_s": sigma_s})
+    (line,) = (w for w in recording.warnings if "no time_offset_s holds throughout" in w)
+    assert line.startswith("gnss: its clock loses ")
+    assert f"all of it at {utc_text(set_ns)[:19]}" in line
+    assert "take one side (--start, --duration)" in line
+    assert recording.clock_doubts == ((line,) if doubted else ())
 
 
 def test_a_sensor_in_another_epoch_is_reported_and_not_fixed(tmp_path: Path) -> None:

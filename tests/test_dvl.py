@@ -212,6 +212,26 @@ def test_tf_turns_what_it_says_to_ahead(tmp_path: Path) -> None:
     assert float(evidence.partition("coherence ")[2].partition(")")[0]) > 0.95
 
 
+@pytest.mark.parametrize(("yaw_deg", "axes"), [(90.0, ("x", "y")), (45.0, ("x", "y")), (0.0, ("x",))])
+def test_a_twist_in_the_axes_of_a_log_is_turned_by_tf(yaw_deg: float, axes: tuple[str, ...], tmp_path: Path) -> None:
+    """Judged by its own x it was 'no velocity of the craft' at 90 deg, drafted by x alone at 45, and gave the IMU a wrong yaw."""
+    make = Messages(2)
+    turned = Rotation.from_euler("ZX", [yaw_deg, 180.0], degrees=True)
+    items: list[Item] = []
+    for topic, at, m in drive(make, seconds=90):
+        if topic == "/wheel/odom":
+            v = turned.inv().apply([m.twist.twist.linear.x, 0.0, 0.0])
+            topic, m = "/dvl/twist", make.twist(at, v.tolist(), frame="dvl_link")
+        items.append((topic, at, m))
+    edges = [("base_link", "dvl_link", (0, 0, 0), turned.as_quat().tolist())]
+    found, config, text = look(tmp_path, [("/tf_static", START_NS, make.transforms(edges)), *items], make)
+    (log,) = logs_of(config)
+    assert (log.topic, log.mount.tf_frame, log.axes) == ("/dvl/twist", "dvl_link", axes)
+    assert "differs from the GNSS track by 0.0" in found.velocities[0].why
+    assert "no velocity of the craft" not in text
+    assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 0.0), abs=0.5)
+
+
 def test_one_that_never_locked_is_no_crash(tmp_path: Path) -> None:
     make = Messages(2)
     items = [*drive(make, seconds=9)]

@@ -15,6 +15,7 @@ from graphloc.config import (
     AerialConfig,
     CompassConfig,
     GnssConfig,
+    ImuConfig,
     VelocityConfig,
     VesselConfig,
     load_config,
@@ -146,6 +147,50 @@ def test_an_imu_that_sits_askew_is_not_taken_for_straight(tmp_path: Path) -> Non
     """It was snapped to a quarter turn, and 40 deg were lost."""
     found, _, _ = look(tmp_path, drive(Messages(2), rotation_z(40.0)), Messages(2))
     assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 40.0), abs=2.0)
+
+
+def swaying(make: Messages, yaw_deg: float, sway_m: float) -> list[Item]:
+    """At 4 m/s, turning to and fro; waves pitch her while they move her aside, which turns what short windows see of an IMU's yaw."""
+    t = np.arange(0.0, 240.0, 0.02)
+    turned, wave = 0.6 * np.sin(2.0 * np.pi * t / 60.0), np.sin(2.0 * np.pi * t / 5.0)
+    ahead = np.exp(1j * turned)
+    way = np.cumsum(4.0 * ahead) * 0.02 + 1j * sway_m * wave * ahead
+    felt = np.gradient(np.gradient(way, t), t) / ahead + 9.81 * np.radians(7.0 * sway_m) * wave
+    rate, R = np.gradient(turned, t), rotation_z(yaw_deg)
+    lla = DATUM.geodetic_from_enu(np.column_stack([way.real, way.imag, 0.0 * t]))
+    items: list[Item] = []
+    for k in range(len(t)):
+        stamp = START_NS + k * S // 50
+        accel = R.T @ [felt[k].real, felt[k].imag, 9.81]
+        items.append(("/imu", stamp, make.imu(stamp, accel, R.T @ [0.0, 0.0, rate[k]])))
+        if k % 10 == 0:
+            items.append(("/fix", stamp, make.fix(stamp, *lla[k])))
+    return items
+
+
+@pytest.mark.parametrize(("yaw_deg", "sway_m"), [(40.0, 0.05), (40.0, 0.1), (90.0, 0.05)])
+def test_a_yaw_by_the_motion_is_drafted_as_well_as_waves_let_it_be_known(
+    yaw_deg: float, sway_m: float, tmp_path: Path
+) -> None:
+    """3 deg off, the heading left bounds that allowed for 1."""
+    make = Messages(2)
+    _, config, _ = look(tmp_path, swaying(make, yaw_deg, sway_m), make)
+    imu = config.sensors["imu"]
+    assert isinstance(imu, ImuConfig)
+    off_deg = abs(imu.mount.rpy_deg[2] - yaw_deg)
+    if yaw_deg == 90.0:  # a quarter turn is exact
+        assert (off_deg, imu.mount_sigma_deg) == (0.0, ImuConfig().mount_sigma_deg)
+    else:
+        assert 2.0 < off_deg < 2.0 * imu.mount_sigma_deg
+
+
+def test_a_yaw_that_windows_of_other_lengths_have_elsewhere_is_not_clear(tmp_path: Path) -> None:
+    """It was drafted as -24 deg, and of a vessel that drifted broadside as -44."""
+    make = Messages(2)
+    found, _, _ = look(tmp_path, swaying(make, 0.0, 0.2), make)
+    mount = found.imus[0].mount
+    assert mount.rpy_deg[2] == 0.0
+    assert "not clearly" in mount.evidence
 
 
 @pytest.mark.parametrize(("yaw_deg", "said"), [(0.0, False), (-84.0, True)])
