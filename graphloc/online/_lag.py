@@ -191,7 +191,8 @@ class Lag:
         Mean (3,), m, and covariance (3, 3), m^2.
         """
         mean, cov = self._judge.others
-        jumped, doubted = self._agreement.wrong_level(self.newest.stamp_ns), self._agreement.doubted
+        jumped = self._agreement.wrong_level(self.newest.stamp_ns)
+        doubted = self._agreement.doubted(self.problem.config.receiver_of)
         timeline = self.problem.timeline
         for stream in self.problem.streams.values():
             share = jumped if stream.left_out is not None else _EITHER if stream.name in doubted else 0.0
