@@ -262,7 +262,16 @@ def test_matches_that_contradict_the_receiver_from_the_start_leave_both_open() -
         away_m = np.eye(len(m.axes))[0] * 7.0
         return replace(m, news=0.5, modes=tuple(replace(mode, value=mode.value + away_m) for mode in m.modes))
 
-    fed = whole([Arrival(a.true_ns, moved(a.m)) for a in arrivals_of(run_of())])
+    online = smoother(run_of())
+    fed = feed(online, run_of(), [Arrival(a.true_ns, moved(a.m)) for a in arrivals_of(run_of())])
+    assert online._tracking is not None  # noqa: SLF001
+    told = online._tracking.estimate()  # noqa: SLF001
+    sought = online._tracking.trajectory(told).cov  # noqa: SLF001
+    assert sought is not None
+    assert np.sqrt(np.trace(told.cov[:2, :2])) > 3.0
+    assert (
+        np.sqrt(np.trace(sought[-1, :2, :2])) < 1.0
+    )  # a wider search around that would find more matches that are false
     off = np.array(fed.errors_m) > 3.0
     assert off[-50:].all()  # the matches are believed, as there is no saying
     held = np.array([e.bound_95_m for e in fed.estimates]) >= fed.errors_m
