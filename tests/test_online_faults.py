@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gtsam
@@ -261,7 +262,16 @@ def test_matches_that_contradict_the_receiver_from_the_start_leave_both_open() -
         away_m = np.eye(len(m.axes))[0] * 7.0
         return replace(m, news=0.5, modes=tuple(replace(mode, value=mode.value + away_m) for mode in m.modes))
 
-    fed = whole([Arrival(a.true_ns, moved(a.m)) for a in arrivals_of(run_of())])
+    online = smoother(run_of())
+    fed = feed(online, run_of(), [Arrival(a.true_ns, moved(a.m)) for a in arrivals_of(run_of())])
+    assert online._tracking is not None  # noqa: SLF001
+    told = online._tracking.estimate()  # noqa: SLF001
+    sought = online._tracking.trajectory(told).cov  # noqa: SLF001
+    assert sought is not None
+    assert np.sqrt(np.trace(told.cov[:2, :2])) > 3.0
+    assert (
+        np.sqrt(np.trace(sought[-1, :2, :2])) < 1.0
+    )  # a wider search around that would find more matches that are false
     off = np.array(fed.errors_m) > 3.0
     assert off[-50:].all()  # the matches are believed, as there is no saying
     held = np.array([e.bound_95_m for e in fed.estimates]) >= fed.errors_m
@@ -283,7 +293,34 @@ def test_a_receiver_that_agreed_with_matches_for_long_is_wrong_where_it_contradi
         agreement.note(match, replace(seen.measurement, stamp_ns=stamp_ns, news=0.1), replace(seen.verdict, weight=1.0))
         at = replace(entry.verdict.at, slow_value=np.array([one_m, 0.0, 0.0]))
         agreement.note(fix, replace(entry.measurement, stamp_ns=stamp_ns), replace(entry.verdict, weight=1.0, at=at))
-    assert agreement.doubted == ["gnss"] * doubted
+    assert agreement.doubted(str) == ["gnss"] * doubted
+
+
+def test_matches_that_one_receiver_confirmed_are_not_in_doubt_beside_another() -> None:
+    """Nor by a trial choice that is given up."""
+    lag = after_12_s()
+    fix, match = lag.problem.streams["gnss"], lag.problem.streams["matcher"]
+    seen, entry = (lag._judge._group(s)[-1] for s in (match, fix))  # noqa: SLF001
+    assert isinstance(seen.measurement, PoseFix)
+    shown = replace(seen.measurement, news=0.1)
+
+    def beside(off_m: list[tuple[str, float]], *, given_up: bool = False) -> list[str]:
+        agreement = Agreement(lag.problem.timeline)
+        for t_s, (name, one_m) in enumerate(off_m):
+            stamp_ns = lag.newest.stamp_ns + t_s * 1_000_000_000
+            mark = agreement.marked()
+            agreement.note(match, replace(shown, stamp_ns=stamp_ns), replace(seen.verdict, weight=1.0))
+            if given_up:
+                agreement.back_to(mark)
+            at = replace(entry.verdict.at, slow_value=np.array([one_m, 0.0, 0.0]))
+            of = SimpleNamespace(name=name, row=fix.row, slow=fix.slow, config=fix.config)
+            agreement.note(of, replace(entry.measurement, stamp_ns=stamp_ns), replace(entry.verdict, weight=1.0, at=at))  # type: ignore[arg-type]
+        return agreement.doubted(str)
+
+    assert beside([("a", 1.0)] * 17 + [("b", 7.0)]) == []
+    assert beside([("b", 7.0)] + [("a", 1.0)] * 17 + [("b", 7.0)]) == []
+    assert beside([("a", 1.0)] * 5 + [("b", 7.0)]) == ["b"]
+    assert beside([("b", 7.0)], given_up=True) == []
 
 
 def test_a_rebuild_does_not_begin_the_wait_for_the_end_of_a_jump_anew() -> None:

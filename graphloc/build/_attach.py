@@ -203,7 +203,7 @@ def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> A
 
 
 def asks_for_delay(constants: Sequence[Constant]) -> bool:
-    """Return what the IMU feels; `carried_to`: body at the measurement, from that at the state; None: they are the same."""
+    """Return whether the delay of a sensor's stamps is one of its constants: only then is asked what the IMU feels (0.2 ms each)."""
     return any(TIME_OFFSET in constant.corrects for constant in constants)
 
 

@@ -30,8 +30,7 @@ class _Standing(NamedTuple):
     """How a sensor agreed last: when, and whether only by a slow error that is unlikely so large.
 
     Attributes:
-        confirmed_s: for how long it has agreed by a usual one while matches did. doubted: beside matches it was far off before it ever did
-            so for long: either may be wrong.
+        confirmed_s: for how long it has agreed by a usual one while matches did. doubted: whether it was ever far off beside them.
     """
 
     stamp_ns: int = 0
@@ -46,7 +45,7 @@ class _Standing(NamedTuple):
         since_s = min((stamp_ns - self.stamp_ns) * 1e-9, 1.0)
         confirmed_s = self.confirmed_s + (since_s if beside and far_sigmas <= _CONFIRMS else 0.0)
         far = far_sigmas > FAR_OFF
-        doubted = confirmed_s < _CONFIRMS_S and (self.doubted or (beside and far))
+        doubted = self.doubted or (beside and far)
         return _Standing(stamp_ns, far, confirmed_s, doubted)
 
 
@@ -81,7 +80,10 @@ class Agreement:
             self._note_level(m.stamp_ns, usual=far <= FAR_OFF)
             if stream.row.false is not None and stream.row.false(m, stream.config).news < 1.0:
                 self._matched_ns = max(self._matched_ns, m.stamp_ns)
-            beside = abs(m.stamp_ns - self._matched_ns) < _BESIDE_S * 1e9
+            jumps = stream.slow is not None and bool(
+                stream.slow.far_axes.any()
+            )  # others tell nothing of matches, least of all these
+            beside = jumps and abs(m.stamp_ns - self._matched_ns) < _BESIDE_S * 1e9
             self._standing[stream.name] = self._standing.get(stream.name, _Standing()).then(m.stamp_ns, far, beside)
         if verdict is not None and agrees and _credible(stream, verdict.at):
             self.agreed_ns[stream.name] = max(m.stamp_ns, self.agreed_ns.get(stream.name, m.stamp_ns))
@@ -114,26 +116,34 @@ class Agreement:
         Args:
             receiver_of: the name of a sensor's receiver (`VesselConfig.receiver_of`): of those that read one by turns the newest counts.
         """
-        newest: dict[str, tuple[int, bool, str]] = {}
+        return sorted(name for standing, name in self._newest(receiver_of) if standing.far)
+
+    def doubted(self, receiver_of: Callable[[str], str]) -> list[str]:
+        """Return the sensors that have been far off beside matches which no receiver has agreed with for long: either may be wrong.
+
+        Args:
+            receiver_of: as for `unlikely`.
+        """
+        if any(standing.confirmed_s >= _CONFIRMS_S for standing in self._standing.values()):
+            return []
+        return [name for standing, name in self._newest(receiver_of) if standing.doubted]
+
+    def _newest(self, receiver_of: Callable[[str], str]) -> list[tuple[_Standing, str]]:
+        newest: dict[str, tuple[_Standing, str]] = {}
         for name, standing in self._standing.items():
             receiver = receiver_of(name)
-            newest[receiver] = max(newest.get(receiver, (0, False, "")), (standing.stamp_ns, standing.far, name))
-        return sorted(name for _, far, name in newest.values() if far)
-
-    @property
-    def doubted(self) -> list[str]:
-        """Names of the sensors that have been far off beside matches since before they ever agreed with them for long: either may be wrong."""
-        return [name for name, standing in self._standing.items() if standing.doubted]
+            newest[receiver] = max(newest.get(receiver, (_Standing(), "")), (standing, name))
+        return list(newest.values())
 
     def marked(self) -> _Mark:
         """Return the state, for `back_to`."""
-        levels = self._usual_ns, self._jumped_ns, self._told_ns
+        levels = self._usual_ns, self._jumped_ns, self._told_ns, self._matched_ns
         return dict(self.agreed_ns), dict(self._standing), list(self._refused), dict(self._denied), *levels
 
     def back_to(self, mark: _Mark) -> None:
         """Forget what was noted since `marked`: it agreed with choices that were given up."""
         self.agreed_ns, self._standing, self._refused, self._denied = mark[:4]
-        self._usual_ns, self._jumped_ns, self._told_ns = mark[4:]
+        self._usual_ns, self._jumped_ns, self._told_ns, self._matched_ns = mark[4:]
 
     def inherit(self, before: Agreement) -> None:
         """Take over when each sensor last agreed, and since when one has been at its usual or another level.
@@ -179,7 +189,9 @@ class Agreement:
         return jumped_s if jumped_s > float(np.clip(end - begin, *_JUMPED_S)) else 0.0
 
 
-_Mark = tuple[dict[str, int], dict[str, _Standing], list[int], dict[str, int], tuple[int, int] | None, int | None, int]
+_Mark = tuple[
+    dict[str, int], dict[str, _Standing], list[int], dict[str, int], tuple[int, int] | None, int | None, int, int
+]
 
 
 def _credible(stream: LiveStream, at: Attachment) -> bool:

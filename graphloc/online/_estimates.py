@@ -54,7 +54,7 @@ def estimate_of(
     gyro = problem.links.gyro_at(np.array([at_ns]))[0] - problem.R_body_imu @ newest.bias.gyroscope()
     cov, v_cov = _covariances(now, lag, R, unmodelled)
     others_m, others_cov = lag.others
-    cov[:3, :3] += others_cov
+    cov[:3, :3] += others_cov + lag.contradicted
     cov[5, 5] += heading_off_rad**2
     widen_heading(cov, heading_var)
     limit_heading(cov)

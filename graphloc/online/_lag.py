@@ -8,7 +8,7 @@ of the states, and neither of these knows the judge.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -24,7 +24,7 @@ from graphloc.online._anchor import Anchor
 from graphloc.online._constants import Constants
 from graphloc.online._entries import Entries
 from graphloc.online._judge import Judge
-from graphloc.online._live import LiveProblem
+from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import Newest, States
 from graphloc.online._unmodelled import BeforeStart, ErrorSizes, UnmodelledError, estimated_beside
 from graphloc.online._window import Window
@@ -186,20 +186,31 @@ class Lag:
 
     @property
     def others(self) -> tuple[Array, Array]:
-        """What other choices of modes, and the other level of a receiver that jumped or contradicts matches, add to the newest position in world.
+        """What other choices of modes, and the other level of a receiver that jumped, add to the newest position in world.
 
         Mean (3,), m, and covariance (3, 3), m^2.
         """
         mean, cov = self._judge.others
-        jumped, doubted = self._agreement.wrong_level(self.newest.stamp_ns), self._agreement.doubted
+        share = self._agreement.wrong_level(self.newest.stamp_ns)
+        if share:
+            cov = cov + share * sum((off for s, off in self._off_squares() if s.left_out is not None), np.zeros((3, 3)))
+        return mean, cov
+
+    @property
+    def contradicted(self) -> Array:
+        """What receivers that contradict the matches add to the covariance (3, 3) of the newest position in world, m^2."""
+        doubted = self._agreement.doubted(self.problem.config.receiver_of)
+        off = (off for s, off in self._off_squares() if s.left_out is None and s.name in doubted) if doubted else ()
+        return np.asarray(_EITHER * sum(off, np.zeros((3, 3))))
+
+    def _off_squares(self) -> Iterator[tuple[LiveStream, Array]]:
+        """Yield each receiver with the square (3, 3), m^2, of how far off it is now by a slow error that may jump."""
         timeline = self.problem.timeline
         for stream in self.problem.streams.values():
-            share = jumped if stream.left_out is not None else _EITHER if stream.name in doubted else 0.0
-            if share and stream.slow is not None:
+            if stream.slow is not None and stream.slow.far:
                 off_m = self._window.values.atVector(keys.slow(stream.number, timeline.slow_of[timeline.last]))
                 off_m = np.where(stream.slow.far_axes, off_m, 0.0)
-                cov = cov + share * np.outer(off_m, off_m)
-        return mean, cov
+                yield stream, np.outer(off_m, off_m)
 
     def inherit(self, before: Lag) -> None:
         """Take over when each sensor last agreed; `before`: the window that this one replaces."""

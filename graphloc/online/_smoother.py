@@ -135,7 +135,7 @@ class OnlineSmoother:
     def window(self) -> Trajectory | None:
         """Return the states of the lag as they are now estimated, up to the newest IMU sample: a prior for front-ends.
 
-        The covariance at all of them is that of the newest.
+        The covariance at all of them is that of the newest, as scans are searched around it (see `Tracking.trajectory`).
         """
         now = self.predict()
         return None if now is None or self._tracking is None else self._tracking.trajectory(now)

@@ -328,12 +328,17 @@ class Tracking:
         return came, float(yaw_from_rotation(R)) - float(np.trapezoid(rates, stamps_of(samples) * 1e-9))
 
     def trajectory(self, now: Estimate) -> Trajectory:
-        """Return the states of the window, and `now` where it is newer; the covariance at all of them is that of `now`."""
+        """Return the states of the window, and `now` where it is newer; the covariance at all of them is that of `now`.
+
+        Without what matches add by contradicting a receiver: scans are matched around this, and a wider search finds more false ones.
+        """
         stamps, p, R, v = self.lag.track()
         if now.stamp_ns > stamps[-1]:
             stamps, p = np.append(stamps, now.stamp_ns), np.vstack([p, now.p_world_m])
             R, v = np.concatenate([R, now.R_world_body[None]]), np.vstack([v, now.v_world_mps])
-        cov = np.broadcast_to(now.cov, (len(stamps), 6, 6))
+        own = now.cov.copy()
+        own[:3, :3] -= self.lag.contradicted
+        cov = np.broadcast_to(own, (len(stamps), 6, 6))
         return Trajectory(stamps_ns=stamps, p_world_m=p, R_world_body=R, v_world_mps=v, cov=cov)
 
     def news(self) -> list[Event]:
