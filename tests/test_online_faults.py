@@ -269,9 +269,8 @@ def test_matches_that_contradict_the_receiver_from_the_start_leave_both_open() -
     sought = online._tracking.trajectory(told).cov  # noqa: SLF001
     assert sought is not None
     assert np.sqrt(np.trace(told.cov[:2, :2])) > 3.0
-    assert (
-        np.sqrt(np.trace(sought[-1, :2, :2])) < 1.0
-    )  # a wider search around that would find more matches that are false
+    # A wider search around that would find more matches that are false.
+    assert np.sqrt(np.trace(sought[-1, :2, :2])) < 1.0
     off = np.array(fed.errors_m) > 3.0
     assert off[-50:].all()  # the matches are believed, as there is no saying
     held = np.array([e.bound_95_m for e in fed.estimates]) >= fed.errors_m

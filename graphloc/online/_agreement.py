@@ -80,9 +80,8 @@ class Agreement:
             self._note_level(m.stamp_ns, usual=far <= FAR_OFF)
             if stream.row.false is not None and stream.row.false(m, stream.config).news < 1.0:
                 self._matched_ns = max(self._matched_ns, m.stamp_ns)
-            jumps = stream.slow is not None and bool(
-                stream.slow.far_axes.any()
-            )  # others tell nothing of matches, least of all these
+            # Sensors without an error that may jump tell nothing of matches, least of all these themselves.
+            jumps = stream.slow is not None and bool(stream.slow.far_axes.any())
             beside = jumps and abs(m.stamp_ns - self._matched_ns) < _BESIDE_S * 1e9
             self._standing[stream.name] = self._standing.get(stream.name, _Standing()).then(m.stamp_ns, far, beside)
         if verdict is not None and agrees and _credible(stream, verdict.at):
