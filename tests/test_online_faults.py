@@ -270,6 +270,9 @@ def test_matches_that_contradict_the_receiver_from_the_start_leave_both_open() -
     assert sought is not None
     assert np.sqrt(np.trace(told.cov[:2, :2])) > 3.0
     assert (
+        np.linalg.eigvalsh(told.cov[:2, :2])[0] > 0.5 * 2.0**2
+    )  # across as well: the receiver that may be right errs by 2 m
+    assert (
         np.sqrt(np.trace(sought[-1, :2, :2])) < 1.0
     )  # a wider search around that would find more matches that are false
     off = np.array(fed.errors_m) > 3.0
