@@ -269,6 +269,8 @@ def test_matches_that_contradict_the_receiver_from_the_start_leave_both_open() -
     sought = online._tracking.trajectory(told).cov  # noqa: SLF001
     assert sought is not None
     assert np.sqrt(np.trace(told.cov[:2, :2])) > 3.0
+    # Across as well: the receiver that may be right errs by 2 m.
+    assert np.linalg.eigvalsh(told.cov[:2, :2])[0] > 0.5 * 2.0**2
     # A wider search around that would find more matches that are false.
     assert np.sqrt(np.trace(sought[-1, :2, :2])) < 1.0
     off = np.array(fed.errors_m) > 3.0

@@ -198,10 +198,18 @@ class Lag:
 
     @property
     def contradicted(self) -> Array:
-        """What receivers that contradict the matches add to the covariance (3, 3) of the newest position in world, m^2."""
+        """What receivers that contradict the matches add to the covariance (3, 3) of the newest position in world, m^2.
+
+        Where a receiver is right it has a slow error all the same, of the usual size.
+        """
         doubted = self._agreement.doubted(self.problem.config.receiver_of)
-        off = (off for s, off in self._off_squares() if s.left_out is None and s.name in doubted) if doubted else ()
-        return np.asarray(_EITHER * sum(off, np.zeros((3, 3))))
+        streams = self._off_squares() if doubted else ()
+        either = (
+            off + np.diag(np.where(s.slow.far_axes, s.slow.sigma**2, 0.0))
+            for s, off in streams
+            if s.left_out is None and s.slow is not None and s.name in doubted
+        )
+        return np.asarray(_EITHER * sum(either, np.zeros((3, 3))))
 
     def _off_squares(self) -> Iterator[tuple[LiveStream, Array]]:
         """Yield each receiver with the square (3, 3), m^2, of how far off it is now by a slow error that may jump."""
