@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Velocities read in the wrong convention are named before anything is solved."""
 
-from types import SimpleNamespace
-from typing import Any, cast
-
 import numpy as np
 import pytest
 
@@ -39,12 +36,11 @@ def said(places: Array, velocities: Array, convention: str = "enu") -> list[str]
         for k, (t, v) in enumerate(zip(ns, velocities, strict=True))
     ]
     config = VelocityConfig.model_validate({"topic": "/v", "convention": convention})
-    readings: list[Any] = [
-        SimpleNamespace(sensor="gnss", config=GnssConfig(topic="/fix"), values=fixes),
-        SimpleNamespace(sensor="velocity", config=config, values=moving),
+    readings = [
+        Readings("gnss", GnssConfig(topic="/fix"), values=[*fixes]),
+        Readings("velocity", config, values=[*moving]),
     ]
-    motions = _motions_of_fixes(cast("list[Readings]", readings))
-    return exchanged_warnings(cast("list[Readings]", readings), motions)
+    return exchanged_warnings(readings, _motions_of_fixes(readings))
 
 
 @pytest.mark.parametrize(("convention", "other"), [("enu", "ned"), ("ned", "enu")])
