@@ -33,6 +33,7 @@ import online_faults
 import simulator
 import single_tags
 import smoothing
+import soak
 import sweep
 import tag_detector
 import where
@@ -69,6 +70,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "E.4": online.shuffled,
     "E.5": online_faults.faults,
     "E.6": online.odometry,
+    "E.day": soak.day,
     "E.dark": dead_reckoning.figures,
     "E.imu": wrong_imu.figures,
     "F.3": batch.figures,
