@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from graphloc.build._attach import Carry, asks_for_delay, state_of
 from graphloc.build._chains import without_drift
-from graphloc.build._problem import PositionJumps, Problem, Stream, inertial_factors, preintegrate
+from graphloc.build._problem import PositionJumps, Problem, Stream, apart_s_of, inertial_factors, preintegrate
 from graphloc.build._usable import silent_sensors, sorted_out, usable_imu
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.frames import Array, Datum
@@ -202,12 +202,6 @@ def _position_jumps(row: Sensor, measurements: Sequence[Measurement], datum: Dat
     places_m = np.array([hint.p_world_m[:2] for _, hint in told])
     sigma_m = np.array([hint.p_sigma_m[:2].max() for _, hint in told])
     return position_jumps(stamps_ns, places_m, sigma_m, allowed_m=allowed_m)
-
-
-def apart_s_of(measurements: Sequence[Measurement]) -> Array:
-    """Return the time since the measurement before, of M measurements (M,), s; inf for the first."""
-    stamps_ns = [m.stamp_ns for m in measurements]
-    return np.concatenate([[np.inf], np.diff(stamps_ns) * 1e-9])[: len(stamps_ns)]
 
 
 def _states_and_carries(

@@ -70,17 +70,18 @@ class Stream:
         lo, hi = np.searchsorted(self.state, [first, last + 1])
         return range(int(lo), int(hi))
 
-    def silenced(self) -> Stream:
-        """Return it without its measurements."""
-        none = np.empty(0)
+    def only(self, indices: NDArray[np.int64]) -> Stream:
+        """Return it with these of its measurements alone."""
+        few = indices.tolist()
+        measurements = tuple(self.measurements[i] for i in few)
         return replace(
             self,
-            measurements=(),
-            state=none.astype(np.int64),
-            carry=(),
-            gyro_radps=np.empty((0, 3)),
-            felt=np.empty((0, 6)),
-            apart_s=none,
+            measurements=measurements,
+            state=self.state[indices],
+            carry=tuple(self.carry[i] for i in few),
+            gyro_radps=self.gyro_radps[indices],
+            felt=self.felt[indices],
+            apart_s=apart_s_of(measurements),
         )
 
 
@@ -118,6 +119,12 @@ class Problem:
     left_out: tuple[tuple[int, int], ...] = ()
     imu_turn_rad: Array = field(default_factory=lambda: np.zeros(3))
     usual_motion: UsualMotion | None = None
+
+
+def apart_s_of(measurements: Sequence[Measurement]) -> Array:
+    """Return the time since the measurement before, of M measurements (M,), s; inf for the first."""
+    stamps_ns = [m.stamp_ns for m in measurements]
+    return np.concatenate([[np.inf], np.diff(stamps_ns) * 1e-9])[: len(stamps_ns)]
 
 
 def preintegrate(timeline: Timeline, links: InertialLink) -> tuple[Any, ...]:
@@ -193,7 +200,8 @@ def with_imu_turned(problem: Problem, values: gtsam.Values, turn_rad: Array) -> 
 
 def without_sensor(problem: Problem, stream: Stream) -> Problem:
     """Return the problem without the measurements of one of its streams."""
-    return replace(problem, streams=tuple(s.silenced() if s is stream else s for s in problem.streams))
+    none = np.empty(0, dtype=np.int64)
+    return replace(problem, streams=tuple(s.only(none) if s is stream else s for s in problem.streams))
 
 
 def _carried_anew(stream: Stream, timeline: Timeline, links: InertialLink, after_ns: int, until_ns: int) -> Stream:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build._attach import every_constant, nav_state
-from graphloc.build._layout import apart_s_of
 from graphloc.build._problem import Problem, Stream, with_links
 from graphloc.time import duration_ns
 from graphloc.timeline import Timeline
@@ -104,16 +103,11 @@ def _states(problem: Problem, chosen: Mapping[int, NDArray[np.int64]]) -> NDArra
 
 def _thin(stream: Stream, indices: NDArray[np.int64], states: NDArray[np.int64]) -> Stream:
     """Return a stream with the kept measurements, on the kept states."""
-    few = indices.tolist()
-    measurements, carried = tuple(stream.measurements[i] for i in few), [stream.carry[i] for i in few]
+    few = stream.only(indices)
     return replace(
-        stream,
-        measurements=measurements,
-        state=np.searchsorted(states, stream.state[indices]),
-        carry=tuple(None if c is None else (int(np.searchsorted(states, c[0])), c[1]) for c in carried),
-        gyro_radps=stream.gyro_radps[indices],
-        felt=stream.felt[indices],
-        apart_s=apart_s_of(measurements),
+        few,
+        state=np.searchsorted(states, few.state),
+        carry=tuple(None if c is None else (int(np.searchsorted(states, c[0])), c[1]) for c in few.carry),
     )
 
 

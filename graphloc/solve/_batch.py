@@ -6,7 +6,8 @@
    new in a window are judged by the prediction without them, with its covariance (`_grow`). Both on a
    thinned run (`graphloc.build.thinned`). Passes over all of it remove the seams: there they cost a fifth.
 3. Passes over the whole run: modes and weights re-chosen until they no longer change (`_passes`).
-4. Try other choices that may be more probable (`_choices`), and repeat 3 where there are any. Where that shows position
+4. Try other choices that may be more probable (`_choices`), and repeat 3 where there are any. Where the first fixes after an
+   outage bend the track, 1 to 4 are repeated without them (`_returns`). Where it shows position
    jumps of the only position sensor, 1 to 4 are repeated with them (`_jumps`). Where the IMU's mount is clearly off, repeat 3 with it
    turned (`_imu_mount`).
 5. Where receivers jump and no other sensor measures position, choose the most probable level (`_levels`).
@@ -41,6 +42,7 @@ from graphloc.solve._jumps import jumps_in, with_jumps_of, with_jumps_off_track
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import cost_of_run, cost_without_outliers, rough_passes
+from graphloc.solve._returns import doubtful_returns
 from graphloc.solve._sensor_noise import scattering
 from graphloc.solve._start import Begun
 
@@ -100,6 +102,7 @@ def solve_batch(
     run = _Underway(problem, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
     run.raise_noise_of_sensors()
     if not newest:
+        run.leave_out_returns()
         run.take_jumps()
         run.estimate_mount()
     noisier = run.raise_imu_noise()
@@ -168,25 +171,38 @@ class _Underway:
             del self.solved  # and its graph, before the next one is made
             self._solve_first(replace(with_sensor_noise(problem, times), usual_motion=None))
 
+    def leave_out_returns(self) -> None:
+        """Solve it anew without the first fixes after outages, if that is clearly more probable."""
+        whole, misfit = self._problem, self.solved.misfit()
+        doubted = doubtful_returns(whole, self.solved.choice(), misfit)
+        if doubted is None:
+            return
+        cost, times = cost_of_run(whole, self.solved.settled.values, self.begun.prior), max(misfit, 1.0)
+        if self._more_probable(doubted.left_out_of(whole), cost - times * doubted.price(whole)):
+            off = doubted.still_off(whole, self.solved.choice())
+            left = self._more_probable(off.left_out_of(whole), cost - times * off.price(whole))
+            self._configured = (off if left else doubted).left_out_of(self._configured)
+
     def take_jumps(self) -> None:
         """Solve it anew with the position jumps that the solution shows, while that is clearly more probable."""
         for _ in range(_MAX_JUMP_ROUNDS):
             jumping = with_jumps_off_track(self._problem, self.solved.settled.verdicts)
-            if jumping is None or not self._clearly_jumps(jumping):
+            if jumping is None:
+                return
+            cost = cost_of_run(self._problem, self.solved.settled.values, self.begun.prior)
+            if not self._more_probable(jumping, cost - CLEARLY * (jumps_in(jumping) - jumps_in(self._problem))):
                 return
 
-    def _clearly_jumps(self, jumping: Problem) -> bool:
-        """Return whether a problem with more jumps is clearly more probable, each of them; else the solution stays what it was."""
+    def _more_probable(self, other: Problem, lowest: float) -> bool:
+        """Return whether another problem costs less (nats) than the lowest; else the solution stays what it was."""
         problem, begun, before = self._problem, self.begun, self.solved.choice()
-        lowest = cost_of_run(problem, before.values, begun.prior)
-        lowest -= CLEARLY * (jumps_in(jumping) - jumps_in(problem))
         del self.solved  # and its graph, before the next one is made
         try:
-            self._solve_first(jumping)
-            if cost_of_run(jumping, self.solved.settled.values, self.begun.prior) < lowest:
+            self._solve_first(other)
+            if cost_of_run(other, self.solved.settled.values, self.begun.prior) < lowest:
                 return True
         except SolveError:
-            pass  # it cannot be solved with them
+            pass  # it cannot be solved so
         self._problem = problem
         self._hold(begun, before.settled_again(begun.prior, self._progress))
         return False

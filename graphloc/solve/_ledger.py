@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from graphloc.build import Judged, Problem
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import Measurement
@@ -16,7 +18,7 @@ def ledger_of(problem: Problem, recording: Recording, verdicts: dict[tuple[int, 
     ledger = Ledger(recording.rows)
     for row in problem.rejected:
         if row.seq >= 0:
-            ledger.add(row)
+            ledger.add(replace(row, topic=row.topic or recording.topics.get(row.sensor, "")))
     imu_topic = recording.topics.get(problem.imu.sensor, "")
     for seq, stamp in zip(problem.imu.seqs.tolist(), problem.imu.stamps_ns.tolist(), strict=True):
         ledger.add(LedgerRow(seq=seq, stamp_ns=stamp, sensor=problem.imu.sensor, topic=imu_topic, outcome=Outcome.USED))

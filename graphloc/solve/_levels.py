@@ -30,8 +30,9 @@ from graphloc.time import NS_PER_S
 _JUMP = 1.0  # sigmas from one node to the next: ten times the drift
 _FAR = 2.0  # sigmas: nearer, the error is at its usual level
 # Each level after each outage is another solution of the whole run.
-_OUTAGE_S, _MOST_OUTAGES, _MOST_LEVELS, _TRIAL_PASSES = 10.0, 4, 3, 6
-_COMES_BACK_OFF = 6.0  # nats: of a receiver that does after an outage
+_MOST_OUTAGES, _MOST_LEVELS, _TRIAL_PASSES = 4, 3, 6
+OUTAGE_S = 10.0
+COMES_BACK_OFF = 6.0  # nats: of a receiver that does after an outage
 
 
 class AtLevel(NamedTuple):
@@ -141,7 +142,7 @@ def _outages(case: _Case) -> list[_Span]:
     stamps_ns = np.sort([m.stamp_ns for s in case.streams for m in s.measurements])
     gaps_ns = np.diff(stamps_ns)
     longest = np.sort(np.argsort(gaps_ns)[-_MOST_OUTAGES:])
-    found = [(int(stamps_ns[n]), int(stamps_ns[n + 1])) for n in longest if gaps_ns[n] > _OUTAGE_S * NS_PER_S]
+    found = [(int(stamps_ns[n]), int(stamps_ns[n + 1])) for n in longest if gaps_ns[n] > OUTAGE_S * NS_PER_S]
     begins, ends = [begin for begin, _ in found], [end for _, end in found]
     return [_Span(*one) for one in zip(found, [None, *ends[:-1]], [*begins[1:], None], strict=True)] if found else []
 
@@ -168,7 +169,7 @@ def _after_outage(
         except SolveError:
             continue
         passes, iterations = passes + other.settled.passes, iterations + other.settled.iterations
-        cost = _COMES_BACK_OFF + _total(other, prior)
+        cost = COMES_BACK_OFF + _total(other, prior)
         if cost < min(costs):
             best = other
         costs.append(cost)

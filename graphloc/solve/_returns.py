@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixes of the only position sensor that lead astray after an outage.
+
+Out of a tunnel, or from under a bridge, a receiver comes back tens of metres off, and converges within half a minute while it states
+metres. Its fixes err alike, so each loss of its own sees them agree, and the track through the outage bends to them. So the run is
+solved without them, too: an error that comes back with a receiver and leaves it again is one event, however many fixes have it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.build import Problem, Stream
+from graphloc.ledger import LedgerRow, Outcome
+from graphloc.position_jumps import MEAN_S
+from graphloc.solve._decide import Verdicts, far_sigmas, met
+from graphloc.solve._final_passes import RunChoice
+from graphloc.solve._levels import COMES_BACK_OFF, OUTAGE_S
+from graphloc.time import NS_PER_S, stamps_of, utc_text
+
+_CONVERGES_S = 40.0  # for so long after an outage its fixes are doubted
+_STILL = 1.5  # as what is far off converges, it is off for longer
+_RIGHT = 1.5  # nats that a right fix costs, half of its axes
+_FAR = 2.0  # sigmas, of fix and slow error, off the track: nearer, a fix has converged
+
+
+class Return(NamedTuple):
+    """The fixes of a receiver after an outage.
+
+    Attributes:
+        outage_ns: stamps of the last fix before it and of the first one after it. fixes: their indices in the stream.
+        off_m: by how much they are off at most; 0: not known.
+    """
+
+    outage_ns: tuple[int, int]
+    fixes: range
+    off_m: float = 0.0
+
+    def price(self, stream: Stream) -> float:
+        """Return what it costs (nats) to leave them out: that a receiver comes back off, for how long, and what right ones would cost."""
+        return COMES_BACK_OFF + self._lasts_s(stream) / MEAN_S + _RIGHT * len(self.fixes)
+
+    def said(self, stream: Stream) -> str:
+        """Say it, for the user."""
+        began, back = self.outage_ns
+        return (
+            f"{stream.name}: back from an outage of {(back - began) / NS_PER_S:.0f} s at {utc_text(back)} it was up to {self.off_m:.0f} m "
+            f"off, and converged within {self._lasts_s(stream):.0f} s: its {len(self.fixes)} fixes of that time are left out"
+        )
+
+    def _lasts_s(self, stream: Stream) -> float:
+        return (stream.measurements[self.fixes[-1]].stamp_ns - self.outage_ns[1]) / NS_PER_S
+
+
+class Returns(NamedTuple):
+    """Returns of one receiver, by the number of its stream."""
+
+    number: int
+    each: tuple[Return, ...]
+
+    def price(self, problem: Problem) -> float:
+        """Return what it costs (nats) to leave all of them out."""
+        return sum(one.price(self._stream(problem)) for one in self.each)
+
+    def _stream(self, problem: Problem) -> Stream:
+        return next(s for s in problem.streams if s.number == self.number)
+
+    def left_out_of(self, problem: Problem) -> Problem:
+        """Return the problem without their fixes."""
+        stream = self._stream(problem)
+        gone = np.array([i for one in self.each for i in one.fixes], dtype=np.int64)
+        kept = stream.only(np.setdiff1d(np.arange(len(stream.measurements)), gone))
+        lost = [stream.measurements[i] for i in gone]
+        why = "after an outage the receiver was off, and converged"
+        rows = [
+            LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic="", outcome=Outcome.REJECTED, reason=why)
+            for m in lost
+        ]
+        return replace(
+            problem,
+            streams=tuple(kept if s is stream else s for s in problem.streams),
+            rejected=(*problem.rejected, *rows),
+            warnings=(*problem.warnings, *(one.said(stream) for one in self.each if one.off_m)),
+        )
+
+    def still_off(self, problem: Problem, without: RunChoice) -> Returns:
+        """Return of their fixes those that a solution without them shows to be far off, all before them, and some after them."""
+        stream, found = self._stream(problem), list[Return]()
+        stamps_ns = stamps_of(stream.measurements)
+        for one in self.each:
+            _, residuals = met(problem, stream, one.fixes, without.values)
+            off_m = np.array([np.linalg.norm(modes[0].raw[:2]) for modes in residuals])
+            far = np.flatnonzero(off_m > _FAR * np.array([_sigma_m(stream, modes[0].cov) for modes in residuals]))
+            if len(far):
+                since_ns = stamps_ns[one.fixes] - one.outage_ns[1]
+                count = int(np.searchsorted(since_ns, _STILL * since_ns[far[-1]], side="right"))
+                found.append(Return(one.outage_ns, one.fixes[:count], float(off_m[far].max())))
+        return self._replace(each=tuple(found))
+
+
+def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Returns | None:
+    """Return the fixes after each outage through which a solution is bent, or that it takes to be far off; None where there are none.
+
+    Only what the IMU, these fixes and jumps of their slow error cost can be saved by leaving them out: else it need not be tried.
+
+    Args:
+        misfit: of the solution: as much as anywhere tells nothing.
+    """
+    absolute = [s for s in problem.streams if s.row.absolute]
+    if len(absolute) != 1 or absolute[0].row.false is not None:
+        return None
+    (stream,) = absolute
+    least = COMES_BACK_OFF * max(misfit, 1.0)
+    returns = [
+        one
+        for one in _returns(stream)
+        if _excess(problem, stream, one, solved) > least or _taken_for_off(stream, one.fixes, solved.verdicts)
+    ]
+    return Returns(stream.number, tuple(returns)) if returns else None
+
+
+def _returns(stream: Stream) -> list[Return]:
+    stamps_ns = stamps_of(stream.measurements)
+    back = np.flatnonzero(np.diff(stamps_ns) > OUTAGE_S * NS_PER_S) + 1
+    ends = np.searchsorted(stamps_ns, stamps_ns[back] + int(_CONVERGES_S * NS_PER_S))
+    # Some fixes must tell the place afterwards, before the next outage.
+    until = np.minimum(ends, np.append(back[1:], len(stamps_ns)) - 1)
+    pairs = zip(back.tolist(), until.tolist(), strict=True)
+    return [Return((int(stamps_ns[a - 1]), int(stamps_ns[a])), range(a, b)) for a, b in pairs if b > a]
+
+
+def _excess(problem: Problem, stream: Stream, one: Return, solved: RunChoice) -> float:
+    """Return by how much the IMU and the fixes cost more (nats) than they should from the beginning of an outage to the last of the fixes."""
+    steps = range(problem.timeline.floor(one.outage_ns[0]), int(stream.state[one.fixes[-1]]))
+    bent = sum(problem.inertial[k].error(solved.values) for k in steps)
+    return _cost_of_fixes(stream, one.fixes, solved.verdicts) + float(bent)
+
+
+def _cost_of_fixes(stream: Stream, fixes: range, verdicts: Verdicts) -> float:
+    residuals = [verdicts[stream.number, i].residual for i in fixes]
+    return sum(stream.config.kernel.loss(r.nis(), len(r.raw)) - _RIGHT for r in residuals)
+
+
+def _taken_for_off(stream: Stream, fixes: range, verdicts: Verdicts) -> bool:
+    return any(far_sigmas(stream.slow, verdicts[stream.number, i].at) > _FAR for i in fixes)
+
+
+def _sigma_m(stream: Stream, cov: NDArray[np.float64]) -> float:
+    """Return how far a fix may be off by its covariance (3, 3), m^2, and its slow error, m."""
+    slow = stream.slow or stream.left_out
+    usual = 0.0 if slow is None else float(np.abs(slow.sigma * slow.scale)[slow.far_axes].max(initial=0.0))
+    return float(np.hypot(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]), usual))
