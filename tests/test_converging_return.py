@@ -23,7 +23,7 @@ _OUTAGE_S, _TAU_S = (30.0, 70.0), 8.0
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
     scenario = Scenario(
-        path="loops", noise="white", duration_s=130.0, outage_s=_OUTAGE_S, pose_hz=0.0, gnss_hz=1.0, compass_hz=1.0,
+        path="loops", noise="clean", duration_s=130.0, outage_s=_OUTAGE_S, pose_hz=0.0, gnss_hz=1.0, compass_hz=1.0,
         gnss_sigma_m=1.0,
     )  # fmt: skip
     return simulate(scenario, 1)
@@ -58,6 +58,7 @@ def test_fixes_of_a_receiver_that_converges_are_left_out(run: SimulatedRun) -> N
     assert {m.stamp_ns for m in fixes if _error_m(run, m, 40.0) > 6.0} <= left_out
     assert not {m.stamp_ns for m in fixes if _error_m(run, m, 40.0) < 0.1} & left_out
     off = errors(solution.trajectory, run.truth)
+    assert off.estimate.cov is not None
     bound_m = np.sqrt(5.99 * np.linalg.eigvalsh(off.estimate.cov[:, :2, :2])[:, -1])
     assert np.mean(off.horizontal_m <= bound_m) >= 0.95
     (said,) = [w for w in solution.stats.warnings if "back from an outage" in w]
