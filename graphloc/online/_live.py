@@ -240,7 +240,6 @@ class LiveStream:
         if stamp_ns - self.told_ns <= silent_s(self.slow, apart_s if math.isfinite(apart_s) else 0.0) * NS_PER_S:
             return False
         self.anew_ns = self.told_ns
-        self.receiver.jump.drawn_anew(stamp_ns)
         return True
 
     def forget(self, before: int) -> None:
@@ -280,6 +279,8 @@ class LiveProblem:
         timeline = self.timeline
         floor, nearest = timeline.floor(m.stamp_ns), timeline.nearest(m.stamp_ns)
         stream.measurements.append(m)
+        if stream.told_ns == stream.anew_ns:  # till now the place was by the level before
+            stream.receiver.jump.drawn_anew(m.stamp_ns)
         stream.told_ns = max(stream.told_ns, m.stamp_ns)
         stream.space()
         stream.state.append(state_of(m, floor, nearest, timeline.stamps_ns, self.links.gaps()))
