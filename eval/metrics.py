@@ -334,7 +334,12 @@ def held_out_table(
     return _table("Against held-out fixes", rows, "the fixes' own noise is part of the error")
 
 
-def speed_table(estimates: _Named, check: SpeedSeries) -> Table:
-    """Return a table with a row per estimate, against an independent forward speed."""
+def speed_table(estimates: _Named, check: SpeedSeries, switched_off: str = "") -> Table:
+    """Return a table with a row per estimate, against an independent forward speed; `switched_off`: the sensor that would fuse it."""
     rows = [(name, compare_speed(t, check)) for name, t in estimates if t.v_world_mps is not None]
-    return _table("Forward speed", rows, f"estimate less {check.topic}, which was not fused")
+    would = (
+        f"; to bridge outages by it set sensors.{switched_off}.enabled in place of check_speed_topic"
+        if switched_off
+        else ""
+    )
+    return _table("Forward speed", rows, f"estimate less {check.topic}, which was not fused{would}")

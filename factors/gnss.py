@@ -39,6 +39,7 @@ from graphloc.graph import (
 from graphloc.measurements import GnssPosition, world_from_fixes
 
 _TIE_M = 0.005  # how exactly leaf and lever arm follow the pose; far below any GNSS noise
+_LOST_S = 2.0  # without RTK fixes; then ambiguities are resolved anew, rightly or wrongly
 _TIE = gtsam.noiseModel.Isotropic.Sigma(3, _TIE_M)
 
 
@@ -141,6 +142,7 @@ def slow(config: GnssConfig) -> SlowProcess | None:
         jumps=s.jumps,
         far=("east", "north") if s.jumps else (),
         needs_company=s.enabled is None,
+        anew_after_s=_LOST_S if config.fixes == "rtk" else math.inf,
     )
 
 

@@ -63,6 +63,8 @@ def _fate(item: OdometryReport) -> str:
         return "in a map grid"
     if item.role == "other":
         return "left out"
+    if item.role == "check_speed" and not item.fused:
+        return f"drafted as {_DRAFTED[item.role]}, and as a sensor that is switched off: fused, it holds the track where fixes fail or are wrong"
     return f"drafted as {_DRAFTED[item.role]}{', switched off' if item.role == 'truth' and item.origin is None else ''}"
 
 

@@ -226,6 +226,7 @@ class SlowProcess:
         jumps: put a robust loss on its steps. far: axes that together may stand much farther off than sigma; tails of their prior.
         needs_company: leave it out where no second sensor can tell it from motion; its size is then
             added to the bounds.
+        anew_after_s: where the sensor was silent for so long it is drawn anew, and says nothing of what it was before; inf: never.
     """
 
     name: str
@@ -239,6 +240,7 @@ class SlowProcess:
     jumps: bool = False
     far: tuple[str, ...] = ()
     needs_company: bool = False
+    anew_after_s: float = math.inf
 
     @property
     def constant(self) -> NDArray[np.bool_]:

@@ -318,6 +318,12 @@ class JumpDetector:
             return _none()
         return np.array([jump.after_ns for jump in jumps], dtype=np.int64), np.array([jump.size_m for jump in jumps])
 
-    def doubtful(self, stamp_ns: int) -> bool:
-        """Return whether there was a jump within the last `LASTS_S`."""
-        return self._last_ns is not None and 0 <= stamp_ns - self._last_ns < LASTS_S * NS_PER_S
+    def drawn_anew(self, stamp_ns: int) -> None:
+        """Take in that the receiver's error is drawn anew at a stamp: which level before was right no longer matters."""
+        if self._last_ns is not None and self._last_ns < stamp_ns:
+            self._last_ns = None
+
+    def doubtful(self, stamp_ns: int, settled_ns: int = 0) -> bool:
+        """Return whether there was a jump within the last `LASTS_S`, and after a stamp at which the place was known without this receiver."""
+        last_ns = self._last_ns
+        return last_ns is not None and last_ns > settled_ns and 0 <= stamp_ns - last_ns < LASTS_S * NS_PER_S

@@ -225,6 +225,9 @@ def test_forward_speed_by_hand() -> None:
     check = SpeedSeries(topic="/wheels", stamps_ns=stamps[5:50], speed_mps=np.full(45, 1.5))
     numbers = metrics.compare_speed(track, check)
     assert (numbers.mean_mps, numbers.std_mps, numbers.samples) == pytest.approx((0.5, 0.0, 45))
+    alone, drafted = (metrics.speed_table([("it", track)], check, name).note for name in ("", "wheels"))
+    assert drafted.startswith(alone)
+    assert "sensors.wheels.enabled" in drafted.removeprefix(alone)
 
 
 def test_coverage_of_the_heading_is_by_its_own_variance() -> None:

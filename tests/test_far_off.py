@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from graphloc import app
-from graphloc.build import at_level, closing_variance, slow_begin, slow_end, slow_step
+from graphloc.build import at_level, closing_variance, slow_begin, slow_end, slow_step, standing_cost
 from graphloc.config import GnssConfig, VelocityConfig, VesselConfig
 from graphloc.eval.drill.failures import script
 from graphloc.eval.metrics import TruthMetrics, compare_to_truth
@@ -108,6 +108,38 @@ def test_a_level_that_is_known_holds_its_nodes_alone() -> None:
     np.testing.assert_allclose(held[:, 0], [0.0, 0.0, 0.5 + walk, walk, 0.5 + walk, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(held[:, 1], held[:, 0], atol=1e-9)
     np.testing.assert_allclose(held[:, 2], [0.5, *[walk] * 5, 0.5 + walk], atol=1e-9)  # up does not stay far off
+
+
+@pytest.mark.parametrize("far", [True, False])
+def test_where_an_error_is_drawn_anew_one_chain_ends_and_another_begins(far: bool) -> None:
+    """7 s, drawn anew after the third: as much information about 0, and on each other, as two chains have, and the cost of both."""
+    of, apart = process(), 3
+    usual, value = np.ones(7, dtype=bool), np.array([20.0, -7.0, 3.0])
+
+    def held(parts: Sequence[range]) -> Array:
+        graph, at = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for part in parts:
+            for factor in [*slow_begin(of, part[0], np.zeros(3), far=far), *slow_end(of, part[-1], far=far)]:
+                graph.add(factor)
+            anew = np.array([j == apart for j in part[:-1]])
+            for j, other in zip(part[:-1], anew, strict=True):
+                for factor in slow_step(of, j, j + 1, 1.0, far=far, anew=bool(other)):
+                    graph.add(factor)
+            if not far:
+                names = usual[part.start : part.stop]
+                for factor in at_level(of, part, np.ones(len(part) - 1), names, anew):
+                    graph.add(factor)
+        for j in range(7):
+            at.insert(j, value)
+        return np.asarray(graph.linearize(at).hessian()[0])
+
+    two = (range(apart + 1), range(apart + 1, 7))
+    np.testing.assert_allclose(held([range(7)]), held(two), atol=1e-9)
+    path = np.tile(value, (7, 1))
+    costs = [standing_cost(of, path[part.start : part.stop], np.ones(len(part) - 1)) for part in two]
+    whole = standing_cost(of, path, np.ones(6), np.arange(6) == apart)
+    assert whole == pytest.approx(sum(costs))
+    assert standing_cost(of, path, np.ones(6)) < 0.7 * whole
 
 
 def test_a_height_far_off_does_not_set_the_place_free() -> None:

@@ -390,6 +390,10 @@ def test_wheels_check_the_speed_rather_than_a_filter_that_had_the_fixes(tmp_path
     why = {item.topic: item.why for item in found.odometry}
     assert "looks like wheel odometry" in why["/wheel/odom"]
     assert "a filter's output" in why["/ekf/odometry_map"]
+    text = render(found)
+    assert not config.sensors["wheels"].enabled
+    assert "/wheel/odom: drafted as check_speed_topic, and as a sensor that is switched off" in text
+    assert text.count("switched off") == 1  # what holds the fixes already is none to switch on
 
 
 @pytest.mark.parametrize(("noise_deg", "both"), [(0.0, False), (1.0, True)], ids=["the same", "another device"])

@@ -144,6 +144,42 @@ def test_a_wrong_rtk_fix_is_not_followed(solve: Callable[[Recording, VesselConfi
     assert any("gnss: position jump" in line for line in (*solution.stats.warnings, *solution.stats.events))
 
 
+@pytest.mark.parametrize("solve", [app.smooth_recording, app.replay_recording], ids=["offline", "online"])
+def test_a_wrong_rtk_fix_ends_where_rtk_does(solve: Callable[[Recording, VesselConfig], app.Run]) -> None:
+    """4 m off from 30 to 40 s, then none; from 55 s on it is right again: ambiguities are resolved anew, so it was not 4 m off still."""
+    _, two = receiver(lambda t: not 40.0 < t < 55.0, lambda t: (4.0, 0.0) if 30.0 < t < 40.0 else (0.0, 0.0))
+    solution, off_m, t = solved(two, solve)
+    back = t > 57.0
+    assert off_m[back].max() < 0.2
+    assert np.mean(off_m < bounds_95(np.asarray(solution.trajectory.cov))[:, 0]) > 0.95
+    assert np.mean([health is Health.GOOD for health, after in zip(solution.health, back, strict=True) if after]) > 0.9
+
+
+def test_a_jump_of_the_other_fixes_is_no_doubt_once_rtk_is_back() -> None:
+    """Online: for 200 s each pose was 'degraded', as no other sensor measured position, though RTK did."""
+    _, two = receiver(
+        lambda t: not 20.0 < t < 45.0,
+        lambda t: (15.0, 0.0) if 30.0 < t < 45.0 else (0.0, 0.0),
+        replace(TRACK, duration_s=80.0),
+    )
+    solution, off_m, t = solved(two, app.replay_recording)
+    assert any("position jump of gnss_other" in line for line in solution.stats.events)
+    good = np.array([health is Health.GOOD for health in solution.health])
+    assert not good[(t > 38.0) & (t < 44.0)].any()
+    assert good[t > 50.0].all()
+    assert off_m[t > 50.0].max() < 0.2
+
+
+def test_rtk_that_comes_back_wrong_is_told_by_the_fixes_beside_it() -> None:
+    """1.5 m off for the first 16 s after an outage of 30 s, then right for 17 s, lost again, and right: only the first part is wrong."""
+    _, two = receiver(
+        lambda t: t < 20.0 or 50.0 < t < 83.0 or t > 92.0, lambda t: (1.5, 0.0) if 50.0 < t < 66.0 else (0.0, 0.0)
+    )
+    solution, off_m, t = solved(two, app.smooth_recording)
+    assert off_m[(t > 50.0) & (t < 83.0)].max() < 0.2
+    assert np.mean(off_m < bounds_95(np.asarray(solution.trajectory.cov))[:, 0]) > 0.95
+
+
 def test_held_out_fixes_without_rtk_measure_nothing() -> None:
     """They are kept out as well, else the track would know what it is to predict; off by metres, they were all of its error."""
     _, two = receiver(comes_and_goes, lambda t: (0.0, 0.0) if comes_and_goes(t) else (1.5, -1.5))

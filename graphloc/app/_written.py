@@ -32,8 +32,9 @@ def tables(run: Run) -> tuple[metrics.Table, ...]:
     if run.held:
         slow = {s.name: s.slow for s in (run.solution, run.online) if s is not None}
         found.append(metrics.held_out_table(estimates, run.held, run.solution.datum, antennas(run), slow))
-    if run.recording.check_speed is not None:
-        found.append(metrics.speed_table(estimates, run.recording.check_speed))
+    if (check := run.recording.check_speed) is not None:
+        off = (n for n, s in run.config.sensors.items() if s.kind == "body_velocity" and s.topic == check.topic)
+        found.append(metrics.speed_table(estimates, check, next(off, "")))
     whys = [f"{f.name}: {f.why}." for f in run.filters if f.why]
     return (replace(found[0], note="\n".join([found[0].note, *whys])), *found[1:]) if found else ()
 

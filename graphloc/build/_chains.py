@@ -31,6 +31,7 @@ _FAR = 2.0  # F above: sigmas beyond which such a component counts as far off
 CONSTANT_TAILS = 9.0  # squared sigmas at which the variance of a constant's prior doubles
 _NOTHING = 1e6  # sigmas: no information
 _NO_DRIFT = 100.0  # times the time constant
+_SILENT = 3.0  # times the usual time between measurements
 _CHAIN_END = 2.0  # variances of the process: the prior at either end of a chain
 
 
@@ -65,6 +66,7 @@ def slow_step(
     far: bool = True,
     jump_m: float = 0.0,
     expected: Array | None = None,
+    anew: bool = False,
 ) -> Iterator[Any]:
     """Yield the factors of the step to the next node, `dt_s` later.
 
@@ -72,17 +74,24 @@ def slow_step(
         jumps: whether steps have a robust loss. far: whether components that may stay far off have a prior; else see `at_level`.
         jump_m: size of a position jump seen in this step: it, or the vessel, has moved so far.
         expected: (k,) the step, where it is known besides.
+        anew: whether one chain ends here and another begins: all but constants is drawn anew (`SlowProcess.anew_after_s`).
     """
     constant = slow.constant
     # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
     step = slow.sigma * np.where(constant, 1e-4, np.sqrt(2.0 * dt_s / slow.time_constant_s))
-    if jump_m > 0.0:
+    if anew:
+        step = np.where(constant, step, slow.sigma * _NOTHING)
+    elif jump_m > 0.0:
         step = np.where(slow.far_axes, jump_m, step)
     model: Any = gtsam.noiseModel.Diagonal.Sigmas(step)
-    if slow.jumps and jumps and jump_m == 0.0:
+    if slow.jumps and jumps and jump_m == 0.0 and not anew:
         model = _with_tails(model, JUMP.scale)
     yield gtsam.BetweenFactorVector(key, following, np.zeros(len(step)) if expected is None else expected, model)
-    yield from _standing(slow, following, 2.0 * slow.time_constant_s / dt_s, jumps=jumps, far=far)
+    if anew:
+        yield from slow_end(slow, key, jumps=jumps, far=far)
+        yield from slow_end(slow, following, jumps=jumps, far=far)
+    else:
+        yield from _standing(slow, following, 2.0 * slow.time_constant_s / dt_s, jumps=jumps, far=far)
 
 
 def without_drift(slow: SlowProcess) -> SlowProcess:
@@ -90,20 +99,31 @@ def without_drift(slow: SlowProcess) -> SlowProcess:
     return replace(slow, time_constant_s=_NO_DRIFT * slow.time_constant_s)
 
 
+def silent_s(slow: SlowProcess, apart_s: float) -> float:
+    """Return after how long without a measurement a slow error is drawn anew, of a sensor whose measurements are usually so far apart, s."""
+    return max(slow.anew_after_s, _SILENT * apart_s)
+
+
 def slow_end(slow: SlowProcess, key: int, *, jumps: bool = True, far: bool = True) -> Iterator[Any]:
     """Yield the prior that closes a chain at its last node; `jumps`, `far` as in `slow_step`."""
     yield from _standing(slow, key, np.full(len(slow.sigma), _CHAIN_END), jumps=jumps, far=far)
 
 
-def at_level(slow: SlowProcess, names: Sequence[int], dt_s: Array, usual: NDArray[np.bool_]) -> Iterator[Any]:
+def at_level(
+    slow: SlowProcess,
+    names: Sequence[int],
+    dt_s: Array,
+    usual: NDArray[np.bool_],
+    anew: NDArray[np.bool_] | None = None,
+) -> Iterator[Any]:
     """Yield the priors of a chain's components that may stay far off, where it is known which nodes are at the usual level.
 
     These have a Gaussian one, whose chain ends at the first and last of them; the others none, as a jump may lead anywhere.
 
     Args:
-        names: (N,) the keys of the nodes. dt_s: (N - 1,) between them. usual: (N,).
+        names: (N,) the keys of the nodes. dt_s: (N - 1,) between them. usual: (N,). anew: (N - 1,) steps at which it is drawn anew.
     """
-    held = _usual_information(slow, dt_s, usual)
+    held = _usual_information(slow, dt_s, usual, anew)
     for n in np.flatnonzero(usual):
         yield _prior(names[int(n)], slow.sigma * np.where(slow.far_axes, np.sqrt(1.0 / held[n]), _NOTHING))
 
@@ -134,24 +154,31 @@ def closing_variance(slow: SlowProcess, value: Array) -> Array:
     return np.where(slow.constant, np.inf, _CHAIN_END * slow.sigma**2 * tails)
 
 
-def standing_cost(slow: SlowProcess, path: Array, dt_s: Array) -> float:
+def standing_cost(slow: SlowProcess, path: Array, dt_s: Array, anew: NDArray[np.bool_] | None = None) -> float:
     """Return the cost (nats) of the priors of a whole chain, of the components that may stay far off.
 
     Args:
-        path: (N, k) nodes. dt_s: (N - 1,) between them.
+        path: (N, k) nodes. dt_s: (N - 1,) between them. anew: (N - 1,) steps at which it is drawn anew.
     """
     far = slow.far_axes
     square = ((path[:, far] / slow.sigma[far]) ** 2).sum(axis=1)
-    held = _usual_information(slow, dt_s, np.ones(len(path), dtype=bool))
+    held = _usual_information(slow, dt_s, np.ones(len(path), dtype=bool), anew)
     return float(held @ np.log1p(square / _FAR**2)) * _FAR**2 / 2.0
 
 
-def _usual_information(slow: SlowProcess, dt_s: Array, usual: NDArray[np.bool_]) -> Array:
-    """Return the information (N,) of the priors about 0 of a chain that ends at the first and last of its `usual` nodes."""
-    held = np.concatenate([[0.0], dt_s / (2.0 * float(slow.time_constant_s[slow.far_axes].max()))])
-    if usual.any():
-        for end in np.flatnonzero(usual)[[0, -1]]:
-            held[end] += 1.0 / _CHAIN_END
+def _usual_information(
+    slow: SlowProcess, dt_s: Array, usual: NDArray[np.bool_], anew: NDArray[np.bool_] | None
+) -> Array:
+    """Return the information (N,) of the priors about 0 of a chain, each part of which ends at the first and last of its `usual` nodes."""
+    steps = dt_s / (2.0 * float(slow.time_constant_s[slow.far_axes].max()))
+    begins = np.flatnonzero(np.zeros(len(dt_s)) if anew is None else anew) + 1
+    held = np.concatenate([[0.0], steps])
+    held[begins] = 0.0
+    for part in np.split(np.arange(len(usual)), begins):
+        at_usual = part[usual[part]]
+        if len(at_usual):
+            held[at_usual[0]] += 1.0 / _CHAIN_END
+            held[at_usual[-1]] += 1.0 / _CHAIN_END
     return held
 
 

@@ -232,10 +232,10 @@ def _add_constants(
 
 @lru_cache(maxsize=1 << 14)
 def _step(
-    slow: SlowProcess, key: int, following: int, dt_s: float, jumps: bool, far: bool, jump_m: float
+    slow: SlowProcess, key: int, following: int, dt_s: float, jumps: bool, far: bool, jump_m: float, anew: bool
 ) -> tuple[Any, ...]:
     """Factors of a step, made once: they do not depend on the estimate, so every graph shares them."""
-    return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, far=far, jump_m=jump_m))
+    return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, far=far, jump_m=jump_m, anew=anew))
 
 
 def _jumps_m(problem: Problem, stream: Stream) -> dict[int, float]:
@@ -296,12 +296,12 @@ def _add_slow_chain(
         else:
             for factor in slow_begin(slow, key[0], values.atVector(key[0]), jumps=jumps, far=far):
                 graph.add(factor)
-    sizes_m = _jumps_m(problem, stream)
+    sizes_m, anew = _jumps_m(problem, stream), np.isin(nodes[:-1], stream.anew)
     for n, j in enumerate(nodes[:-1]):
-        for factor in _step(slow, key[n], key[n + 1], dt_s[n], jumps, far, sizes_m.get(j, 0.0)):
+        for factor in _step(slow, key[n], key[n + 1], dt_s[n], jumps, far, sizes_m.get(j, 0.0), bool(anew[n])):
             graph.add(factor)
     for factor in slow_end(slow, key[-1], jumps=jumps, far=far):
         graph.add(factor)
     if stream.usual is not None:
-        for factor in at_level(slow, key, np.array(dt_s), stream.usual[nodes.start : nodes.stop]):
+        for factor in at_level(slow, key, np.array(dt_s), stream.usual[nodes.start : nodes.stop], anew):
             graph.add(factor)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.build._attach import Carry, asks_for_delay, state_of
-from graphloc.build._chains import without_drift
+from graphloc.build._chains import silent_s, without_drift
 from graphloc.build._problem import PositionJumps, Problem, Stream, apart_s_of, inertial_factors, preintegrate
 from graphloc.build._usable import silent_sensors, sorted_out, usable_imu
 from graphloc.config import SensorConfig, VesselConfig
@@ -146,7 +146,7 @@ def _streams(
         t, R = mount_of(name, config, mounts)
         slow, left_out, jumps = _slow_and_jumps(row, config, own, problem.datum, company, alone=alone)
         state, carry = _states_and_carries(own, problem.timeline, problem.links)
-        constants, stamps_ns = row.constants(config), stamps_of(own)
+        constants, stamps_ns, apart_s = row.constants(config), stamps_of(own), apart_s_of(own)
         found.append(
             Stream(
                 number=number,
@@ -164,7 +164,8 @@ def _streams(
                 carry=carry,
                 gyro_radps=problem.links.gyro_at(stamps_ns),
                 felt=problem.links.felt_at(stamps_ns) if asks_for_delay(constants) else np.zeros((len(own), 6)),
-                apart_s=apart_s_of(own),
+                apart_s=apart_s,
+                anew=_drawn_anew(slow, apart_s, problem.timeline.slow_of[state]),
             )
         )
     return tuple(found)
@@ -182,6 +183,14 @@ def _slow_and_jumps(
     if left_out is not None and len(jumps[0]):
         slow, left_out = without_drift(left_out), None
     return slow, left_out, jumps
+
+
+def _drawn_anew(slow: SlowProcess | None, apart_s: Array, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return `anew` of a `Stream`: the slow nodes of the last measurements before it was silent; `nodes`: (M,) that of each."""
+    if slow is None or len(apart_s) < 2:
+        return np.zeros(0, dtype=np.int64)
+    silent = np.isfinite(apart_s) & (apart_s > silent_s(slow, float(np.median(apart_s[1:]))))
+    return np.asarray(np.roll(nodes, 1)[silent & (np.diff(nodes, prepend=nodes[0]) > 0)])
 
 
 def jumping(stream: Stream, stamps_ns: NDArray[np.int64], sizes_m: Array) -> Stream:

@@ -44,6 +44,7 @@ class Stream:
         gyro_radps: (M, 3) raw rate at each measurement, body axes. felt: (M, 6) raw specific force and change of the rate about it; 0 where no delay is asked for.
         apart_s: (M,) time since the measurement before; inf for the first.
         shares: number of the sensor that has the same constants (`shared_constants`); None: they are its own.
+        anew: after which slow nodes (K,) its slow error is drawn anew.
         usual: at which slow nodes (N,) its error is at its usual level; None: not known (see `solve/_levels.py`).
     """
 
@@ -62,6 +63,7 @@ class Stream:
     gyro_radps: Array
     felt: Array
     apart_s: Array
+    anew: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     usual: NDArray[np.bool_] | None = None
     shares: int | None = None
 
@@ -201,7 +203,9 @@ def with_imu_turned(problem: Problem, values: gtsam.Values, turn_rad: Array) -> 
 def without_sensor(problem: Problem, stream: Stream) -> Problem:
     """Return the problem without the measurements of one of its streams."""
     none = np.empty(0, dtype=np.int64)
-    return replace(problem, streams=tuple(s.only(none) if s is stream else s for s in problem.streams))
+    return replace(
+        problem, streams=tuple(replace(s.only(none), anew=none) if s is stream else s for s in problem.streams)
+    )
 
 
 def _carried_anew(stream: Stream, timeline: Timeline, links: InertialLink, after_ns: int, until_ns: int) -> Stream:

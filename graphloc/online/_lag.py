@@ -276,7 +276,11 @@ class Lag:
         The only position sensor has jumped, scans are stamped far off, or a sensor agrees only by a slow error that is unlikely so large.
         """
         streams = self.problem.streams.items()  # where a slow error is left out, the bounds include it
-        doubtful = [n for n, s in streams if (s.left_out is None or s.jumps) and s.receiver.jump.doubtful(stamp_ns)]
+        doubtful = [
+            n
+            for n, s in streams
+            if (s.left_out is None or s.jumps) and s.receiver.jump.doubtful(stamp_ns, self._settled_ns(n))
+        ]
         late = [
             n
             for n, s in streams
@@ -284,6 +288,13 @@ class Lag:
         ]
         unlikely = self._agreement.unlikely(self.problem.config.receiver_of)
         return "; ".join([*map(why_in_doubt, doubtful), *map(why_late, late), *map(why_unlikely, unlikely)])
+
+    def _settled_ns(self, name: str) -> int:
+        """Return when last a sensor of smaller slow error agreed that reads the same receiver by turns (RTK); 0: there is none."""
+        own, streams = self.problem.streams[name], self.problem.streams
+        beside = [streams[other] for other in self.problem.config.by_turns(name)[1:] if other in streams]
+        better = [s.name for s in beside if s.slow and own.slow and s.slow.sigma[0] < own.slow.sigma[0]]
+        return max((self._agreement.agreed_ns.get(other, 0) for other in better), default=0)
 
     @property
     def denied(self) -> Mapping[str, int]:

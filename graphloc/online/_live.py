@@ -21,6 +21,7 @@ from graphloc.build import (
     mount_of,
     rows_of,
     shared_constants,
+    silent_s,
     slow_or_left_out,
     state_of,
     without_drift,
@@ -36,7 +37,7 @@ from graphloc.online._repeated_velocity import RepeatedVelocityDetector
 from graphloc.online._scatter import Scatter
 from graphloc.online._setup import Setup
 from graphloc.position_jumps import JumpDetector, PositionJump
-from graphloc.time import duration_ns
+from graphloc.time import NS_PER_S, duration_ns
 
 T = TypeVar("T")
 _LAST = 15  # measurements up to one, by stamp, from which a sensor's rate at it is taken
@@ -175,6 +176,7 @@ class LiveStream:
             separates it from motion; both, once the receiver has jumped: then the window estimates its jumps.
         by_stamp: stamps (ns) and indices of the measurements that are kept, in order.
         jumps: those that the window estimates.
+        told_ns: the newest stamp of its measurements. anew_ns: that of the newest before its slow error was last drawn anew.
         shares: as of a `build.Stream`.
     """
 
@@ -197,6 +199,8 @@ class LiveStream:
     frozen_detector: FrozenReceiverDetector = field(default_factory=FrozenReceiverDetector)
     receiver: ReceiverDetectors = field(default_factory=ReceiverDetectors)
     jumps: tuple[PositionJump, ...] = ()
+    told_ns: int = 0
+    anew_ns: int | None = None
     shares: int | None = None
 
     @property
@@ -227,6 +231,16 @@ class LiveStream:
         self.apart_s.append(math.inf)
         for n in range(first, min(first + _LAST + 1, len(self.by_stamp))):
             self.apart_s[self.by_stamp[n][1]] = _apart_s(self.by_stamp[max(n - _LAST, 0) : n + 1])
+
+    def drawn_anew(self, stamp_ns: int) -> bool:
+        """Return whether its slow error is drawn anew at a stamp: once as it has been silent for so long."""
+        if self.slow is None or self.told_ns == self.anew_ns:
+            return False
+        apart_s = self.apart_s[len(self.measurements) - 1] if self.by_stamp else 0.0
+        if stamp_ns - self.told_ns <= silent_s(self.slow, apart_s if math.isfinite(apart_s) else 0.0) * NS_PER_S:
+            return False
+        self.anew_ns = self.told_ns
+        return True
 
     def forget(self, before: int) -> None:
         """Forget the measurements before an index."""
@@ -265,6 +279,9 @@ class LiveProblem:
         timeline = self.timeline
         floor, nearest = timeline.floor(m.stamp_ns), timeline.nearest(m.stamp_ns)
         stream.measurements.append(m)
+        if stream.told_ns == stream.anew_ns:  # till now the place was by the level before
+            stream.receiver.jump.drawn_anew(m.stamp_ns)
+        stream.told_ns = max(stream.told_ns, m.stamp_ns)
         stream.space()
         stream.state.append(state_of(m, floor, nearest, timeline.stamps_ns, self.links.gaps()))
         stream.carry.append(carry)
@@ -315,7 +332,7 @@ def live_problem(
     streams = {
         name: _live_stream(
             setup, name, number, by_name[name], t, company,
-            receiver=receivers.setdefault(name, ReceiverDetectors()), known=name in slow_known,
+            receiver=receivers.setdefault(name, ReceiverDetectors()), known=name in slow_known, start_ns=start_ns,
         )
         for number, name in enumerate(config.sensors)
         if name in by_name
@@ -344,6 +361,7 @@ def _live_stream(
     *,
     receiver: ReceiverDetectors,
     known: bool,
+    start_ns: int,
 ) -> LiveStream:
     """Return the stream of a sensor, without measurements.
 
@@ -368,6 +386,7 @@ def _live_stream(
         scatter=Scatter(jumps=slow is not None and slow.jumps),
         receiver=receiver,
         jumps=receiver.jump.jumps,
+        told_ns=start_ns,
     )
 
 

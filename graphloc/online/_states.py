@@ -181,9 +181,15 @@ class States:
                 continue
             key, following = (keys.slow(stream.number, n) for n in (j, j + 1))
             jump_m, step = self._jumped(stream, j, j + 1)
+            anew = stream.drawn_anew(self._problem.timeline.slow_stamps_ns[j + 1])
+            value = (
+                np.where(stream.slow.constant, window.values.atVector(key), 0.0)
+                if anew
+                else window.values.atVector(key)
+            )
             # Begun at the other level, it would be drawn back to the usual one by the prior that closes the chain, and the pose with it.
-            window.guess(following, window.values.atVector(key) + (0.0 if step is None else step), t)
-            window.add(slow_step(stream.slow, key, following, dt_s, jump_m=jump_m, expected=step))
+            window.guess(following, value + (0.0 if step is None else step), t)
+            window.add(slow_step(stream.slow, key, following, dt_s, jump_m=jump_m, expected=step, anew=anew))
             if stream.name in self._ends:
                 window.remove(self._ends[stream.name])
             ends = list(slow_end(stream.slow, following))

@@ -173,7 +173,8 @@ class _Underway:
 
     def leave_out_returns(self) -> None:
         """Solve it anew without the first fixes after outages, if that is clearly more probable."""
-        whole, misfit = self._problem, self.solved.misfit()
+        # With the noise that the sensors were found to have: else it would be saved with their fixes.
+        whole, misfit = replace(self.solved.problem, usual_motion=None), self.solved.misfit()
         doubted = doubtful_returns(whole, self.solved.choice(), misfit)
         if doubted is None:
             return

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import gtsam
@@ -25,7 +26,7 @@ from graphloc.position_jumps import MEAN_S
 from graphloc.recording import Progress
 from graphloc.solve._decide import Stage, Verdicts, decisions, weigh
 from graphloc.solve._passes import Settled, cost_of_run, settle
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, stamps_of
 
 _JUMP = 1.0  # sigmas from one node to the next: ten times the drift
 _FAR = 2.0  # sigmas: nearer, the error is at its usual level
@@ -66,19 +67,22 @@ class _Case(NamedTuple):
         nodes = range(len(self.problem.timeline.slow_stamps_ns))
         return [np.array([self.settled.values.atVector(keys.slow(s.number, j)) for j in nodes]) for s in self.streams]
 
-    def levels(self, from_ns: int | None = None, until_ns: int | None = None) -> list[Array]:
+    def levels(self, span: _Span | None = None) -> list[Array]:
         """Return the levels (3,), m, of the errors, of a span: each once, without the usual one."""
-        stamps_ns = self.problem.timeline.slow_stamps_ns
-        first = 0 if from_ns is None else int(np.searchsorted(stamps_ns, from_ns))
-        last = None if until_ns is None else int(np.searchsorted(stamps_ns, until_ns))
+        stamps_ns, nodes, of = self.problem.timeline.slow_stamps_ns, slice(None), None
+        if span is not None:
+            first = 0 if span.from_ns is None else int(np.searchsorted(stamps_ns, span.from_ns))
+            last = None if span.until_ns is None else int(np.searchsorted(stamps_ns, span.until_ns))
+            nodes, of = slice(first, last), span.of
         pairs = zip(self.streams, self.paths(), strict=True)
-        return [level for s, path in pairs for level in _levels(s.slow, path[first:last])]
+        return [level for s, path in pairs if of in (None, s.number) for level in _levels(s.slow, path[nodes])]
 
-    def cost(self, one: Callable[[SlowProcess, Array, Array], float], level: Array) -> float:
-        """Return the cost (nats) of the errors if this level were the usual one, by a function of process, path and time between nodes."""
+    def cost(self, one: Callable[[SlowProcess, Array, Array, NDArray[np.bool_]], float], level: Array) -> float:
+        """Return the cost (nats) of the errors if this level were the usual one, by a function of process, path, time between nodes, and `anew`."""
         dt_s = np.diff(self.problem.timeline.slow_stamps_ns) / NS_PER_S
         pairs = zip(self.streams, self.paths(), strict=True)
-        return sum(one(s.slow, path - level, dt_s) for s, path in pairs if s.slow is not None)
+        steps = range(len(dt_s))
+        return sum(one(s.slow, path - level, dt_s, np.isin(steps, s.anew)) for s, path in pairs if s.slow is not None)
 
     def places(self) -> Array:
         """Return the position (N, 3) of the states, m."""
@@ -99,8 +103,8 @@ def at_usual_level(
     case, others, passes, iterations = _Case(problem, settled), np.zeros((len(problem.timeline), 3, 3)), 0, 0
     if not case.levels() or _told_otherwise(problem, settled.verdicts):
         return AtLevel(problem, settled, prior, others, 0, 0)
-    for span_ns in () if newest else _outages(case):
-        case, beside, tried = _after_outage(case, span_ns, prior, progress)
+    for span in () if newest else [*_outages(case), *_drawn_anew(case)]:
+        case, beside, tried = _after_outage(case, span, prior, progress)
         others += beside
         passes, iterations = passes + tried[0], iterations + tried[1]
     levels = [np.zeros(3), *case.levels()]
@@ -130,11 +134,18 @@ def at_usual_level(
 
 
 class _Span(NamedTuple):
-    """An outage, from the last fix to the next one, and where the one before it ends and the one after it begins (stamps, ns)."""
+    """An outage, from the last fix to the next one, and where the one before it ends and the one after it begins (stamps, ns).
+
+    Attributes:
+        of: number of the stream whose error is drawn anew there; None: of all receivers, whose error goes on.
+        back_ns: where that is drawn anew next, and another level ends; None: the run ends first.
+    """
 
     gap_ns: tuple[int, int]
     from_ns: int | None
     until_ns: int | None
+    of: int | None = None
+    back_ns: tuple[int, int] | None = None
 
 
 def _outages(case: _Case) -> list[_Span]:
@@ -145,6 +156,21 @@ def _outages(case: _Case) -> list[_Span]:
     found = [(int(stamps_ns[n]), int(stamps_ns[n + 1])) for n in longest if gaps_ns[n] > OUTAGE_S * NS_PER_S]
     begins, ends = [begin for begin, _ in found], [end for _, end in found]
     return [_Span(*one) for one in zip(found, [None, *ends[:-1]], [*begins[1:], None], strict=True)] if found else []
+
+
+def _drawn_anew(case: _Case) -> list[_Span]:
+    """Return where errors are drawn anew: the longest of these outages that a part with a jump follows."""
+    found: list[_Span] = []
+    for stream in case.streams:
+        stamps_ns = stamps_of(stream.measurements)
+        back = np.searchsorted(stamps_ns, case.problem.timeline.slow_stamps_ns[stream.anew + 1])
+        gaps: list[tuple[int, int] | None] = [(int(stamps_ns[n - 1]), int(stamps_ns[n])) for n in back]
+        for gap_ns, next_ns in pairwise([*gaps, None]):
+            assert gap_ns is not None
+            found.append(_Span(gap_ns, gap_ns[1], next_ns and next_ns[0], of=stream.number, back_ns=next_ns))
+    found = [span for span in found if case.levels(span)]
+    longest = sorted(found, key=lambda span: span.gap_ns[1] - span.gap_ns[0])[-_MOST_OUTAGES:]
+    return sorted(longest)
 
 
 def _after_outage(
@@ -158,18 +184,19 @@ def _after_outage(
         The solution, the covariance (N, 3, 3) that the others add, and the passes and iterations of all of them.
     """
     best, costs, places, passes, iterations = case, [_total(case, prior)], [case.places()], 0, 0
-    for level in case.levels(span.from_ns, span.until_ns)[:_MOST_LEVELS]:
-        back = np.array([span.gap_ns[1]]), np.array([np.linalg.norm(level)])
-        streams = (jumping(s, *back) if s in case.streams else s for s in case.problem.streams)
-        problem = replace(case.problem, streams=tuple(streams))
-        moved = _moved(case, -level, span.gap_ns)
+    for level in case.levels(span)[:_MOST_LEVELS]:
+        back, problem = (np.array([span.gap_ns[1]]), np.array([np.linalg.norm(level)])), case.problem
+        if span.of is None:
+            streams = (jumping(s, *back) if s in case.streams else s for s in case.problem.streams)
+            problem = replace(case.problem, streams=tuple(streams))
+        moved = _moved(case, -level, span)
         verdicts = weigh(problem, moved, first=0, last=len(problem.timeline) - 1, stage=Stage.FINAL)
         try:
             other = _Case(problem, settle(problem, moved, verdicts, prior, progress, _TRIAL_PASSES))
         except SolveError:
             continue
         passes, iterations = passes + other.settled.passes, iterations + other.settled.iterations
-        cost = COMES_BACK_OFF + _total(other, prior)
+        cost = (0.0 if span.of is not None else COMES_BACK_OFF) + _total(other, prior)
         if cost < min(costs):
             best = other
         costs.append(cost)
@@ -203,12 +230,12 @@ def _levels(slow: SlowProcess | None, path: Array) -> list[Array]:
     return found
 
 
-def _cost(slow: SlowProcess, path: Array, dt_s: Array) -> float:
+def _cost(slow: SlowProcess, path: Array, dt_s: Array, anew: NDArray[np.bool_]) -> float:
     """Return the cost (nats) of an error (N, 3): of its size, and of the time that it is far off."""
-    return standing_cost(slow, path, dt_s) + _away_cost(slow, path, dt_s)
+    return standing_cost(slow, path, dt_s, anew) + _away_cost(slow, path, dt_s, anew)
 
 
-def _away_cost(slow: SlowProcess, path: Array, dt_s: Array) -> float:
+def _away_cost(slow: SlowProcess, path: Array, dt_s: Array, _anew: NDArray[np.bool_]) -> float:
     return float(dt_s @ _away(slow, path)[1:]) / MEAN_S
 
 
@@ -231,13 +258,15 @@ def _prior_moved(prior: StartPrior, by_m: Array) -> StartPrior:
     return replace(prior, pose=gtsam.Pose3(prior.pose.rotation(), prior.pose.translation() + by_m))
 
 
-def _moved(case: _Case, by_m: Array, gap_ns: tuple[int, int] | None = None) -> gtsam.Values:
-    """Return the run shifted by (3,), m, in world, and the slow errors of the receivers to match; what follows a gap, if it is given."""
+def _moved(case: _Case, by_m: Array, span: _Span | None = None) -> gtsam.Values:
+    """Return the run shifted by (3,), m, in world, and the slow errors of the receivers to match; what follows an outage, if one is given."""
     moved, timeline = gtsam.Values(case.settled.values), case.problem.timeline
 
     def shifts(stamps_ns: NDArray[np.int64]) -> Array:
-        share = np.ones(len(stamps_ns)) if gap_ns is None else np.interp(stamps_ns, gap_ns, (0.0, 1.0))
-        return np.outer(share, by_m)
+        if span is None:
+            return np.tile(by_m, (len(stamps_ns), 1))
+        back_ns = span.back_ns or ()
+        return np.outer(np.interp(stamps_ns, [*span.gap_ns, *back_ns], [0.0, 1.0, 1.0, 0.0][: 2 + len(back_ns)]), by_m)
 
     for k, shift in enumerate(shifts(timeline.stamps_ns)):
         pose = moved.atPose3(keys.pose(k))
