@@ -93,6 +93,7 @@ from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic, is_rectified
 from graphloc.frozen_receiver import frozen_fixes
 from graphloc.measurements import CompassHeading
+from graphloc.pauses import common_pauses, pauses_warning
 from graphloc.time import NS_PER_S, seconds_between
 from graphloc.white_noise import white_noise
 
@@ -276,6 +277,10 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
             refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)
     steps = _clock_steps(streams)
     warnings = (*warnings, *(at.said(topic) for topic, at in steps.items()))
+    imu = next((s for s in streams if s.msgtype == IMU and len(s)), None)
+    if imu is not None:
+        said = pauses_warning(common_pauses(np.sort(imu.stamps_ns), (s.stamps_ns for s in streams if s is not imu)))
+        warnings = (*warnings, *([said] if said else []))
     return _Contents(
         source=source, topics=topics, streams={s.topic: s for s in streams},
         aligned={s.topic: s for s in on_one_clock([_as_mostly_set(s, steps) for s in streams if len(s)])},
