@@ -112,7 +112,8 @@ def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
                 f"{t.topic}: of its sentences not read: {', '.join(named)}{', ...' if len(t.unread) > _MOST_NAMED else ''}"
             )
         if t.undecodable or t.no_stamp:
-            lines.append(f"{t.topic}: {t.undecodable} messages cannot be decoded, {t.no_stamp or 0} have no stamp")
+            why = f" as {t.msgtype} ({t.broken})" if t.broken else ""
+            lines.append(f"{t.topic}: {t.undecodable} messages cannot be decoded{why}, {t.no_stamp or 0} have no stamp")
     return lines
 
 

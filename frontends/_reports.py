@@ -62,6 +62,7 @@ class TopicReport:
     """A topic. Stamps are header stamps; None where messages of this type are not unpacked.
 
     Attributes:
+        broken: why the first of the undecodable messages is that; '' where there is none.
         gaps: intervals longer than 5 usual ones (and 0.1 s); max_gap_s: the longest interval.
         repeated, backward: stamps equal to, or before, the one before; no_stamp: zero stamps.
         recorded: whether the headers hold no stamps, or whole seconds only, so that the recording times stand for them here.
@@ -75,6 +76,7 @@ class TopicReport:
     msgtype: str
     count: int
     undecodable: int = 0
+    broken: str = ""
     frame_id: str = ""
     start_ns: int | None = None
     span_s: float | None = None
