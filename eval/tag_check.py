@@ -185,22 +185,28 @@ def _facing_elsewhere(
 
     A camera's mount that is turned shows the tag elsewhere, too: what puts it nearer to its place is taken for the cause.
     """
-    seen: dict[Key, list[tuple[float, float, float]]] = defaultdict(list)
     if not (doubted := _doubted(sightings, rows)):
         return []
-    for m, p, R in zip(doubted, *solution.trajectory.poses_at(stamps_of(doubted)), strict=True):
+    turned = _faces_turned(doubted, solution, _FACES_DEG)
+    return [_faces_elsewhere(key, by_deg, config) for key, by_deg in turned.items()]
+
+
+def _faces_turned(sightings: list[TagSighting], solution: Solution, least_deg: float) -> dict[Key, float]:
+    """Return by how much tags are turned about up, deg, at least, where that puts them nearer to their places than a mount would."""
+    seen: dict[Key, list[tuple[float, float, float]]] = defaultdict(list)
+    for m, p, R in zip(sightings, *solution.trajectory.poses_at(stamps_of(sightings)), strict=True):
         for k, tag in enumerate(m.tags):
             if (turned := _turned_about_up(m, k, p, R)) is not None:
                 seen[m.sensor, tag].append(turned)
-    lines = []
+    found_deg = {}
     for key, found in sorted(seen.items()):
         turn_deg, by_facing_m, by_mount_m = np.array(found).T
         usual, scatter_deg = _usual(Rotation.from_euler("z", turn_deg[:, None], degrees=True))
         usual_deg = float(usual.as_rotvec(degrees=True)[2])
         nearer = np.median(by_facing_m) < _ALONG * np.median(by_mount_m)
-        if len(found) >= _FEWEST and nearer and abs(usual_deg) > max(_FACES_DEG, scatter_deg / _STEADY):
-            lines.append(_faces_elsewhere(key, usual_deg, config))
-    return lines
+        if len(found) >= _FEWEST and nearer and abs(usual_deg) > max(least_deg, scatter_deg / _STEADY):
+            found_deg[key] = usual_deg
+    return found_deg
 
 
 def _turned_about_up(m: TagSighting, k: int, p: Array, R: Array) -> tuple[float, float, float] | None:
@@ -380,7 +386,9 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
         off_rad = (usual * Rotation.from_matrix(doubted[0].R_body_camera).inv()).as_rotvec()
         rolled = np.degrees(np.hypot(*off_rad[:2])) > _TURNED_DEG
         if (rolled or not elsewhere) and off_deg > _TURNED_DEG and scatter_deg < _STEADY * off_deg:
-            lines.append(_looks_elsewhere(sensor, camera, off_deg, usual))
+            faces = _faces_turned(doubted, solution, _TURNED_DEG)
+            every = len(faces) == len({(m.sensor, tag) for m in doubted for tag in m.tags})
+            lines.append(_looks_elsewhere(sensor, camera, off_deg, usual) + (_or_faces(faces) if every else ""))
         elif elsewhere:
             lines.append(_all_elsewhere(sensor, camera, moved))
     return lines
@@ -422,6 +430,15 @@ def _looks_elsewhere(sensor: str, camera: str, off_deg: float, mount: Rotation) 
     return (
         f"{sensor}: camera {camera}: by its tags it looks {off_deg:.0f} deg elsewhere than its mount says: rpy_deg "
         f"[{rpy}] would do (of the optical frame: x right, y down, z forward)"
+    )
+
+
+def _or_faces(faces: Mapping[Key, float]) -> str:
+    """Return the other explanation for a camera that looks elsewhere: all tags face another way (deg), less than none could be off by."""
+    turn_deg = float(np.median(list(faces.values())))
+    return (
+        f"; or, which puts the tags nearer to their places, they all face {abs(turn_deg):.0f} deg further "
+        f"{'counter-clockwise' if turn_deg > 0.0 else 'clockwise'} than the survey says (facing_deg, rpy_deg), or the heading is off by as much"
     )
 
 

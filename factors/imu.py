@@ -26,6 +26,7 @@ is known.
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 import gtsam
@@ -42,6 +43,8 @@ from graphloc.series import integral, interpolated
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # white noise of unknown motion in a gap
 _SHORT_S = 2.0  # longest gap that is interpolated linearly
 _FORGET_S, _AROUND_S = 1.0, 10.0  # decay of the last sample in a gap; length of the means on either side
+_LAID_MPS = 3.0  # of a vessel before its velocity is known
+_ASKEW_RAD = 0.1  # of the direction of what moves across a pause
 _GAP_STEP_S = 0.1  # integration step across a gap
 _ABOUT_NS = 100_000_000  # to either side of a stamp: shorter than waves, longer than vibration
 _INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz)-like floor that keeps position covariance positive
@@ -62,6 +65,7 @@ class Links:
         self._gravity_mps2 = gravity_mps2 if config.gravity != "removed" else 0.0
         gyro = config.gyro_noise_radps * noise_scale
         self._left_out: list[tuple[int, int]] = []
+        self._pauses: list[tuple[int, int]] = []
         self._params = self._make_params(self._gravity_mps2, config.accel_noise_mps2 * noise_scale, np.full(3, gyro))
 
     def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
@@ -79,9 +83,14 @@ class Links:
         within = [gap for gap in self._left_out if after_ns <= gap[0] and gap[1] <= until_ns]
         self._left_out = [gap for gap in self._left_out if gap not in within] + [(after_ns, until_ns)]
 
+    def pause(self, after_ns: int, until_ns: int) -> None:
+        """Allow for no time having passed between two samples: it is a gap then, however short."""
+        self._pauses.append((after_ns, until_ns))
+
     def forget(self, before_ns: int) -> None:
         """Drop the samples before a stamp except the last of them, and those that tell how a gap goes on."""
         self._left_out = [gap for gap in self._left_out if gap[1] >= before_ns]
+        self._pauses = [pause for pause in self._pauses if pause[1] >= before_ns]
         before_ns = min([before_ns, *(a - int(_AROUND_S * 1e9) for a, _ in self._left_out)])
         first = max(int(np.searchsorted(self._stamps, before_ns)) - 1, 0)
         self._stamps, self._samples = self._stamps[first:].copy(), self._samples[first:].copy()
@@ -121,6 +130,10 @@ class Links:
             going = going or Going(bias, np.zeros(3))
             samples, bias = self._bridge(middles, samples, gap, going), going.bias
             params = self._gap_params(start_ns, stop_ns, gap)
+        for pause in self._pauses:
+            within_ns = min(stop_ns, pause[1]) - max(start_ns, pause[0])
+            if within_ns > 0:
+                params = self._paused(params, pause, within_ns / (stop_ns - start_ns), going)
         pim = gtsam.PreintegratedImuMeasurements(params, bias)
         for sample, dt in zip(samples, dts, strict=True):
             if dt > 0.0:
@@ -193,6 +206,24 @@ class Links:
         white = self._config.gyro_noise_radps * self._noise_scale
         tilt = np.hypot(white, _UNKNOWN_RADPS * np.sqrt(share / ((stop_ns - start_ns) * 1e-9)))
         return self._make_params(0.0, _UNKNOWN_MPS2, np.array([tilt, tilt, _UNKNOWN_RADPS]))
+
+    def _paused(self, params: Any, pause: tuple[int, int], share: float, going: Going | None) -> Any:
+        """Return the parameters of an interval, a share of which lies in a pause: it may be that no time passed, and nothing moved.
+
+        Over the whole of a pause g that is worth v g, w g and (f - f_m) g, 1 sigma; f_m: the mean force around it, as that is gravity.
+        """
+        moved = _squared(going.v_body_mps) if going else _LAID_MPS**2 * np.eye(3)
+        bias = going.bias if going else gtsam.imuBias.ConstantBias()
+        sample = self._at(np.array(pause)).mean(axis=0)
+        force = sample[:3] - np.mean(self._means_around(*pause), axis=0)[:3]
+        spread = share * (pause[1] - pause[0]) * 1e-9
+        paused = deepcopy(params)
+        paused.setIntegrationCovariance(params.getIntegrationCovariance() + spread * moved)
+        paused.setGyroscopeCovariance(
+            params.getGyroscopeCovariance() + spread * _squared(sample[3:] - bias.gyroscope())
+        )
+        paused.setAccelerometerCovariance(params.getAccelerometerCovariance() + spread * _squared(force))
+        return paused
 
     def _means_around(self, start_ns: int, stop_ns: int) -> tuple[Array, Array]:
         """Return the means (6,) of the seconds before and after a gap; a side with too few samples takes the mean of the other."""
@@ -268,7 +299,12 @@ class Links:
         """Return the gaps in the data, (start, stop) in ns."""
         wide = np.flatnonzero(np.diff(self._stamps) > self._max_gap_ns)
         found = {(int(self._stamps[i]), int(self._stamps[i + 1])) for i in wide}
-        return sorted(found | {self._around(*gap) for gap in self._left_out})
+        return sorted(found | {self._around(*gap) for gap in self._left_out} | set(self._pauses))
+
+
+def _squared(v: Array) -> Array:
+    """Return the covariance (3, 3) of what is v (3,) or nothing, whose direction is known to `_ASKEW_RAD` when a link is made."""
+    return np.asarray(np.outer(v, v) + _ASKEW_RAD**2 * float(v @ v) * np.eye(3))
 
 
 def _sinh_share(t: Array, length: float) -> Array:

@@ -65,7 +65,7 @@ def topic_report(stream: TopicData, count: int) -> TopicReport:
     base = {"topic": stream.topic, "msgtype": stream.msgtype, "count": count}
     stamps, logs = stream.stamps_ns, stream.logs_ns
     if len(stamps) == 0:
-        return TopicReport(**base, undecodable=stream.undecodable, no_stamp=stream.no_stamp)  # type: ignore[arg-type]
+        return TopicReport(**base, undecodable=stream.undecodable, broken=stream.broken, no_stamp=stream.no_stamp)  # type: ignore[arg-type]
     steps = np.diff(stamps)
     # Messages that come out of order leave no gap, and the rate is not that of those in order.
     ahead = np.diff(stamps if _clock.set_backs(stamps) else np.sort(stamps))
@@ -75,6 +75,7 @@ def topic_report(stream: TopicData, count: int) -> TopicReport:
     return TopicReport(
         **base,  # type: ignore[arg-type]
         undecodable=stream.undecodable,
+        broken=stream.broken,
         frame_id=stream.frame_id,
         start_ns=int(stamps.min()),
         span_s=float(stamps.max() - stamps.min()) / NS_PER_S,

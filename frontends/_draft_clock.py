@@ -16,6 +16,7 @@ from graphloc.frontends._clock import (
     reference_of,
 )
 from graphloc.frontends._reports import (
+    FITS_WITH_FIXES,
     CompassReport,
     GnssReport,
     Inspection,
@@ -105,6 +106,8 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
         by = found.late_by if isinstance(found, GnssReport) and found.late_by.partition(" ")[0] != topic else ""
         whose = f"the motion of {by}, taken for the same receiver's," if by else "its motion"
         fits = "its turns fit the gyro's" if kind == "compass" else f"what the IMU feels fits {whose}"
+        if not isinstance(found, GnssReport | None) and found.late_with_fixes:
+            fits = FITS_WITH_FIXES
         why.append(f"{fits} {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
     after = _after(kind, topic, inspection) if not why else None
     if after is not None:

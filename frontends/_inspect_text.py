@@ -7,7 +7,15 @@ from collections.abc import Sequence
 from itertools import islice
 
 from graphloc.frontends._draft_clock import clock_lines
-from graphloc.frontends._reports import GnssReport, ImuReport, Inspection, OdometryReport, TopicReport, of_nmea
+from graphloc.frontends._reports import (
+    FITS_WITH_FIXES,
+    GnssReport,
+    ImuReport,
+    Inspection,
+    OdometryReport,
+    TopicReport,
+    of_nmea,
+)
 from graphloc.plain import aligned
 from graphloc.time import utc_text
 
@@ -35,7 +43,8 @@ def render(inspection: Inspection) -> str:
                 "heading by half a turn: set its mount's yaw to 0, and turn that of the IMU by 180 where it is by the motion"
             )
         if compass.late_s:
-            lines.append("  its turns fit the gyro's {:+.2f} +- {:.2f} s from its stamps".format(*compass.late_s))
+            fits = FITS_WITH_FIXES if compass.late_with_fixes else "its turns fit the gyro's"
+            lines.append("  {} {:+.2f} +- {:.2f} s from its stamps".format(fits, *compass.late_s))
     for twist in inspection.velocities:
         lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:
@@ -105,7 +114,8 @@ def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
                 f"{t.topic}: of its sentences not read: {', '.join(named)}{', ...' if len(t.unread) > _MOST_NAMED else ''}"
             )
         if t.undecodable or t.no_stamp:
-            lines.append(f"{t.topic}: {t.undecodable} messages cannot be decoded, {t.no_stamp or 0} have no stamp")
+            why = f" as {t.msgtype} ({t.broken})" if t.broken else ""
+            lines.append(f"{t.topic}: {t.undecodable} messages cannot be decoded{why}, {t.no_stamp or 0} have no stamp")
     return lines
 
 

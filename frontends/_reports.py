@@ -23,6 +23,8 @@ _DIFFERS = 1.5  # times the default of a slow error
 # Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
 _RTK_M = (0.05, 0.1)
 _RTK_SCATTER_M = 0.1
+FITS_WITH_FIXES = "what the IMU feels fits the motion of the fixes in the same messages"
+"""Why the stamps of a heading, or a velocity, are late, where it does not tell that itself."""
 WATER = " (through water)"
 """At the end of the name of a stream of those of a Doppler log's messages that say so."""
 FILTER = " (of a filter)"
@@ -60,6 +62,7 @@ class TopicReport:
     """A topic. Stamps are header stamps; None where messages of this type are not unpacked.
 
     Attributes:
+        broken: why the first of the undecodable messages is that; '' where there is none.
         gaps: intervals longer than 5 usual ones (and 0.1 s); max_gap_s: the longest interval.
         repeated, backward: stamps equal to, or before, the one before; no_stamp: zero stamps.
         recorded: whether the headers hold no stamps, or whole seconds only, so that the recording times stand for them here.
@@ -73,6 +76,7 @@ class TopicReport:
     msgtype: str
     count: int
     undecodable: int = 0
+    broken: str = ""
     frame_id: str = ""
     start_ns: int | None = None
     span_s: float | None = None
@@ -237,7 +241,7 @@ class CompassReport:
         wander_deg: how far its error wanders beside the gyroscope, 1 sigma for a minute; None where that does not tell.
         two_antennas: whether a GNSS receiver says it, by its sentence, its topic, or as an Imu with an orientation alone.
         late_s: what should be added to its stamps by the gyroscope, s, and 1 sigma; None where that does not tell. What is said above is
-            of corrected stamps.
+            of corrected stamps. late_with_fixes: not the gyroscope tells it, but the fixes of the same messages.
     """
 
     topic: str
@@ -254,6 +258,7 @@ class CompassReport:
     wander_deg: float | None = None
     two_antennas: bool = False
     late_s: tuple[float, float] | None = None
+    late_with_fixes: bool = False
 
     @property
     def ahead(self) -> bool:
@@ -268,9 +273,9 @@ class CompassReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VelocityReport:
-    """A velocity topic: the axes that fit the GNSS track ('unknown': none does; None: nothing to judge by), and why; `late_s` as of a receiver.
+    """A velocity topic: the axes that fit the GNSS track (unknown: none does; None: nothing to judge by), and why.
 
-    `reverse`: it says astern throughout, which is taken for a wrong sign. `mount`: of one whose own axes are known by its type.
+    `late_s` as of a receiver, `late_with_fixes` as of a compass. `reverse`: it says astern throughout, which is taken for a wrong sign. `mount`: of one whose own axes are known by its type.
     `sideways`: a log's, or that of one which sits turned, that tells its speed to the side, too. `rpy_deg`: how its axes sit by tf, where the
     track does not deny it.
     """
@@ -281,6 +286,7 @@ class VelocityReport:
     why: str
     tf_frame: str | None
     late_s: tuple[float, float] | None = None
+    late_with_fixes: bool = False
     reverse: bool = False
     mount: MountGuess | None = None
     sideways: bool = False

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc.errors import in_one_line
 from graphloc.frames import Array
 from graphloc.frontends import nmea
 from graphloc.frontends._rejections import Rejection
@@ -186,6 +187,7 @@ class TopicData:
     Arrays are made once, and cannot be written to.
 
     recorded: whether the stamps are recording times, because the headers hold none, or whole seconds only.
+    broken: why the first message that cannot be decoded is that.
     part: what it is of a maker's message; None of other messages. filtered: how many of these a filter made, by what they say.
     drift_ppm: by how much the clock ran fast; what it gained is taken off the stamps. elapsed: (N,) ns from the beginning of the bag.
     """
@@ -194,6 +196,7 @@ class TopicData:
     msgtype: str
     frame_id: str = ""
     undecodable: int = 0
+    broken: str = ""
     no_stamp: int = 0
     recorded: bool = False
     drift_ppm: float = 0.0
@@ -397,13 +400,22 @@ def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> Sentence
             if raw.topic in mixed:
                 at_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns) or raw.log_ns
                 sentences.take(raw.topic, nmea.text_of(msg), _places(said), at_ns)
-        except Exception:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything; counted
+        except Exception as error:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything; counted
             said = [(streams[raw.topic], None)] if raw.topic in streams else []
+            for stream, _ in said:
+                stream.broken = stream.broken or _why_broken(error, msg)
         if raw.topic == TF_STATIC:
             tree.take(raw.msgtype, msg)
         for stream, row in said:
             _add(stream, row, raw, msg)
     return sentences
+
+
+def _why_broken(error: Exception, msg: Any) -> str:
+    """Return why a message cannot be decoded; `msg`: it, unpacked by the definition in the bag, or None where its bytes do not fit that."""
+    if msg is None:
+        return f"its bytes do not fit its definition ({type(error).__name__})"
+    return f"by its definition in the bag it is another version than is read here: {in_one_line(error)}"
 
 
 def _places(said: Sequence[tuple[TopicData, Row | None]]) -> list[str]:

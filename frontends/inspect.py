@@ -93,6 +93,7 @@ from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic, is_rectified
 from graphloc.frozen_receiver import frozen_fixes
 from graphloc.measurements import CompassHeading
+from graphloc.pauses import common_pauses, pauses_warning
 from graphloc.time import NS_PER_S, seconds_between
 from graphloc.white_noise import white_noise
 
@@ -170,6 +171,10 @@ class _Contents:
         return None if self.tf_pose(stream) is None else stream.frame_id
 
 
+_Late = Mapping[str, tuple[float, float] | None]  # by receiver, as `GnssReport.late_s`
+_NONE: _Late = {}
+
+
 class _Track(NamedTuple):
     """Track of the best receiver: stamps (N,), positions (N, 3) m about the first fix, their noise (m, 1 sigma), first fix."""
 
@@ -220,17 +225,18 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     reports = [report for _, report in odometry]
     doppler = {v.topic for _, v in velocities if v.axes in (EAST_AXES, NORTH_AXES) and not filtered(v.topic)}
     own = [motion for motion in motions if motion.source in doppler]
+    timed = [_timed_fixes(report, late, motions, velocities, bag.streams) for report in gnss]
+    together = {_receiver(report.topic): report.late_s for report in timed if report.late_s}
+    if felt and any(c.late_s is None and _receiver(c.topic) in together for c in compasses):
+        compasses = _compass_reports(bag, imus, felt.turning, courses, together)
     return Inspection(
         source=bag.source,
         topics=_topic_reports(bag),
         imus=tuple(imus),
-        gnss=tuple(
-            _beside_motion(_timed_fixes(report, late, motions, velocities, bag.streams), bag, rolling, own)
-            for report in gnss
-        ),
+        gnss=tuple(_beside_motion(report, bag, rolling, own) for report in timed),
         compasses=compasses,
         odometry=tuple(reports),
-        velocities=tuple(replace(report, late_s=_clearly(late.get(report.topic))) for _, report in velocities),
+        velocities=tuple(_timed_velocity(report, late.get(report.topic), together) for _, report in velocities),
         lidars=_lidars(bag),
         cameras=_cameras(bag),
         tf_frames=tree.frames,
@@ -271,6 +277,10 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
             refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)
     steps = _clock_steps(streams)
     warnings = (*warnings, *(at.said(topic) for topic, at in steps.items()))
+    imu = next((s for s in streams if s.msgtype == IMU and len(s)), None)
+    if imu is not None:
+        said = pauses_warning(common_pauses(np.sort(imu.stamps_ns), (s.stamps_ns for s in streams if s is not imu)))
+        warnings = (*warnings, *([said] if said else []))
     return _Contents(
         source=source, topics=topics, streams={s.topic: s for s in streams},
         aligned={s.topic: s for s in on_one_clock([_as_mostly_set(s, steps) for s in streams if len(s)])},
@@ -325,9 +335,9 @@ def _gnss_reports(bag: _Contents) -> list[GnssReport]:
 
 
 def _receiver(topic: str) -> str:
-    """Return the receiver of a stream of fixes: of NMEA the talker on its topic, whose sentences tell one position, with a height or without."""
+    """Return the receiver of a stream: its topic; of NMEA the talker on it, whose sentences tell one position, with a height or without."""
     name, _, sentence = topic.partition(" ")
-    return f"{name} {sentence[:2]}" if sentence else name
+    return name if sentence[:1] in ("", "(") else f"{name} {sentence[:2]}"
 
 
 def _octave(gnss: GnssReport, wanders_m: float | None, level_m: float, *, claimed: bool) -> int:
@@ -380,29 +390,52 @@ def _odometry_reports(
 
 
 def _compass_reports(
-    bag: _Contents, imus: Sequence[ImuReport], turning: Turning | None, courses: Courses | None
+    bag: _Contents, imus: Sequence[ImuReport], turning: Turning | None, courses: Courses | None, together: _Late = _NONE
 ) -> tuple[CompassReport, ...]:
-    """Report every orientation that may be a heading, by how the best IMU turned; see `_without_echoes` for their order."""
+    """Report every orientation that may be a heading, by how the best IMU turned; see `_without_echoes` for their order.
+
+    Args:
+        together: how late the stamps of a receiver's fixes are, by receiver.
+    """
     candidates = bag.of_type(QUATERNION, IMU, *NUMBERS)
-    found = _without_echoes([pair for s in candidates if (pair := _timed_compass(s, courses, turning))])
+    timed = (_timed_compass(s, courses, turning, together.get(_receiver(s.topic))) for s in candidates)
+    found = _without_echoes([pair for pair in timed if pair])
     best = (imus[0], bag.aligned[imus[0].topic]) if imus else None
     return tuple(_beside_gyro(report, stream, best) for report, stream in found)
 
 
 def _timed_compass(
-    stream: TopicData, courses: Courses | None, turning: Turning | None
+    stream: TopicData, courses: Courses | None, turning: Turning | None, fixes_late_s: tuple[float, float] | None
 ) -> tuple[CompassReport, TopicData] | None:
-    """Report an orientation, its stamps corrected by what the gyroscope shows, and return it so; None where it is no heading."""
+    """Report an orientation, its stamps corrected by what the gyroscope shows, and return it so; None where it is no heading.
+
+    Where that shows nothing, by how late the fixes of the same messages are, unless the gyroscope then denies it.
+    """
     report = compass_report(stream, courses, turning)
     if report is None or turning is None or not report.usable:
         return None if report is None else (report, stream)
     stamps, angle = headings(stream)
-    late_s = heading_time_offset(turning, stamps, angle if report.convention == "enu" else -angle)
+    angle = angle if report.convention == "enu" else -angle
+    own_s = heading_time_offset(turning, stamps, angle)
+    late_s = own_s or fixes_late_s
     if late_s is None:
         return report, stream
-    timed = stream.later(round(late_s[0] * NS_PER_S))
+    by_ns = round(late_s[0] * NS_PER_S)
+    if own_s is None and heading_time_offset(turning, stamps + by_ns, angle) is not None:
+        return report, stream
+    timed = stream.later(by_ns)
     again = compass_report(timed, courses, turning)
-    return (report, stream) if again is None or not again.usable else (replace(again, late_s=late_s), timed)
+    if again is None or not again.usable:
+        return report, stream
+    return replace(again, late_s=late_s, late_with_fixes=own_s is None), timed
+
+
+def _timed_velocity(report: VelocityReport, late: MotionOffset | None, together: _Late) -> VelocityReport:
+    """Return the report with how late its stamps are: by its motion; where that is not clear, by the fixes of the same messages, unless it denies them."""
+    fixes_late_s = together.get(_receiver(report.topic))
+    if _clearly(late) or fixes_late_s is None or (late and late.denies(MotionOffset(*fixes_late_s, clear=True))):
+        return replace(report, late_s=_clearly(late))
+    return replace(report, late_s=fixes_late_s, late_with_fixes=True)
 
 
 def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:

@@ -434,7 +434,7 @@ def _ins_type(msg: Any) -> int | str:
 
 def _ins_trouble(msg: Any) -> Rejection | None:
     """Return why an INSPVAX, or an INSPVA, which holds less, is no solution."""
-    settled, solution = _oem7_code(msg, "ins_status", "status"), _ins_type(msg)
+    settled, solution = _oem7_code(msg, "ins_status", "status", "insstatus"), _ins_type(msg)
     if settled in _INS_SETTLED and solution in _OEM7_STATUS:
         return None
     return rejected(f"no solution (ins_status {settled}, type {_OEM7_NONE.get(solution, solution)})")
@@ -448,8 +448,12 @@ def _ins_velocity(msg: Any) -> SaidVelocity | Rejection:
     if trouble := _ins_trouble(msg):
         return trouble
     north, east, up = (_known(_oem7_sigma(msg, f"{way}_velocity")) for way in ("north", "east", "up"))
-    v = float(msg.east_velocity), float(msg.north_velocity), float(msg.up_velocity)
-    return SaidVelocity(v, max(north, east), up, filtered=True)
+    # INSPVA of `novatel_msgs` numbers them, in the order of the receiver's log.
+    v = (
+        float(_any(msg, *names))
+        for names in (("east_velocity", "vely"), ("north_velocity", "velx"), ("up_velocity", "velz"))
+    )
+    return SaidVelocity((next(v), next(v), next(v)), max(north, east), up, filtered=True)
 
 
 def _ins_heading(msg: Any) -> SaidHeading | Rejection:
@@ -700,7 +704,7 @@ VENDORS: dict[str, tuple[Part, ...]] = {
     ),
     **dict.fromkeys(("novatel_oem7_msgs/msg/HEADING2", "novatel_gps_msgs/msg/NovatelHeading2"), (Part("compass", _oem7_heading),)),
     **dict.fromkeys(
-        ("novatel_oem7_msgs/msg/INSPVAX", "novatel_oem7_msgs/msg/INSPVA", "novatel_msgs/msg/INSPVAX", "novatel_gps_msgs/msg/Inspvax", "novatel_gps_msgs/msg/Inspva"),
+        ("novatel_oem7_msgs/msg/INSPVAX", "novatel_oem7_msgs/msg/INSPVA", "novatel_msgs/msg/INSPVAX", "novatel_msgs/msg/INSPVA", "novatel_gps_msgs/msg/Inspvax", "novatel_gps_msgs/msg/Inspva"),
         (Part("gnss", _ins_place), Part("gnss_velocity", _ins_velocity), Part("compass", _ins_heading, antennas=False)),
     ),
     "irp_sen_msgs/msg/vrs": (Part("gnss", _vrs_place),),

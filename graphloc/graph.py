@@ -438,6 +438,10 @@ class InertialLink(Protocol):
         """Treat an interval as a gap, however short: its samples are dropped, and those that are added later are after it."""
         ...
 
+    def pause(self, after_ns: int, until_ns: int) -> None:
+        """Allow for no time having passed between two samples, however near to each other: a clock may have been set."""
+        ...
+
     def forget(self, before_ns: int) -> None:
         """Drop the samples before a stamp, but for the last of them."""
         ...

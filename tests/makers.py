@@ -54,6 +54,20 @@ float32 azimuth_std
 uint32 extended_status
 uint16 seconds_since_update
 {_NOVATEL_HEADER}""",
+    "novatel_msgs/msg/INSPVA": f"""novatel_msgs/CommonHeader header
+int32 week
+float64 gpssec
+float64 latitude
+float64 longitude
+float64 altitude
+float64 velx
+float64 vely
+float64 velz
+float64 roll
+float64 pitch
+float64 azimuth
+uint32 insstatus
+{_NOVATEL_HEADER}""",
     "novatel_msgs/msg/BESTPOS": f"""novatel_msgs/CommonHeader header
 uint32 solution_status
 uint32 position_type

@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 VOCABULARY = {
-    "errors", "time", "chi2", "gauss", "frames", "measurements", "ledger", "trajectory", "config", "recording", "offsets", "solution", "estimate", "plain", "blocks", "frozen_imu", "imu_spikes", "imu_scatter", "frozen_receiver", "position_jumps", "survey", "berths", "extras", "thinning", "white_noise", "series", "folders", "_config_docs",
+    "errors", "time", "chi2", "gauss", "frames", "measurements", "ledger", "trajectory", "config", "recording", "offsets", "solution", "estimate", "plain", "blocks", "frozen_imu", "imu_spikes", "imu_scatter", "frozen_receiver", "position_jumps", "pauses", "survey", "berths", "extras", "thinning", "white_noise", "series", "folders", "_config_docs",
 }  # fmt: skip
 DOOR = {"__main__", "app", "cli", "drills", "found_tags", "gather", "replay", "stream", "job", "sweep", "ablations"}
 GRAPH = {"graph", "linear", "motion_model", "keys", "timeline", "build", "solve", "online", "origin", "outputs"}

@@ -28,6 +28,7 @@ from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, re
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.makers import said
 from tests.test_bag import KINDS
 from tests.test_inspect import DATUM, ROLL_90, G, drive, look, rotation_z
 
@@ -927,6 +928,42 @@ def test_fixes_that_are_stamped_late_get_an_offset(late_s: float, tmp_path: Path
     assert (config.sensors["gnss"].time_offset_s != 0.0) == (late_s != 0.0)
     assert isinstance(config.sensors["gnss"], GnssConfig)
     assert config.sensors["gnss"].stamp_sigma_s >= 0.05  # what is left is estimated with the run
+
+
+@pytest.mark.parametrize("heading", ["late, hardly turning", "in time, turning"])
+def test_a_heading_of_late_messages_is_as_late_as_the_place_in_them(heading: str, tmp_path: Path) -> None:
+    """One message has one stamp: the place had got its offset, and the heading beside it, whose slow turns tell nothing, had not."""
+    make, rng, late_s = Messages(2), np.random.default_rng(1), 0.4
+    turning = heading == "in time, turning"
+    t = np.arange(0.0, 150.0, 0.02)
+    speed = 3.0 + 1.5 * np.sin(0.4 * t)
+    rate = 0.25 * np.sin(0.5 * t) if turning else 0.01 * np.sin(0.05 * t)
+    yaw = np.concatenate([[0.3], 0.3 + np.cumsum(rate[:-1]) * 0.02])
+    way = np.cumsum(speed * np.exp(1j * yaw)) * 0.02
+    lla = DATUM.geodetic_from_enu(np.column_stack([way.real, way.imag, 0 * t]))
+    accel = np.column_stack([0.6 * np.cos(0.4 * t), speed * rate, np.full(len(t), G)])
+    items: list[Item] = []
+    for k in range(len(t)):
+        at = START_NS + k * S // 50
+        items.append(("/imu", at, make.imu(at, accel[k], (0.0, 0.0, rate[k] + 1e-3 * rng.normal()))))
+        if k % 10 == 0:
+            late = at + round(late_s * S)
+            told = yaw[min(k + round(50 * late_s), len(t) - 1) if turning else k] + np.radians(1.0) * rng.normal()
+            pose = {
+                "position": dict(zip(("latitude", "longitude", "altitude"), lla[k], strict=True)),
+                "orientation": make.quat((0.0, 0.0, np.sin(0.5 * told), np.cos(0.5 * told))),
+            }
+            msg = said(make, "geographic_msgs/msg/GeoPoseStamped", header=make.header(late), pose=pose)
+            items.append(("/geopose", late, msg))
+    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert config.sensors["gnss"].time_offset_s == pytest.approx(-late_s, abs=0.1)
+    compass = config.sensors["compass"]
+    if turning:  # the gyroscope denies it
+        assert compass.time_offset_s == pytest.approx(0.0, abs=0.03)
+        return
+    assert compass.time_offset_s == config.sensors["gnss"].time_offset_s
+    assert "fits the motion of the fixes in the same messages" in text
+    assert "fits the motion of the fixes in the same messages" in render(found)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.2])

@@ -25,6 +25,7 @@ from graphloc.replay import replay
 from graphloc.solution import Solution
 from graphloc.solve._align import _level, _turns, align
 from graphloc.solve._parts import _join_stats
+from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory, bounds_95
 from tests.slowly import simulate_slowly
 
@@ -112,6 +113,28 @@ def test_a_late_first_position_is_no_confident_prior() -> None:
     assert ours.coverage_95 is not None
     assert ours.coverage_95 > 0.85
     assert ours.position_rmse_m < 15.0
+
+
+@pytest.mark.parametrize("dark_s", [(0.0, 32.0), (10.0, 42.0), (0.0, 20.0)], ids=["begins", "ends", "begins, shorter"])
+def test_what_the_imu_alone_carries_at_an_end_is_said(dark_s: tuple[float, float]) -> None:
+    """A vessel that lay in a boathouse for 78 s was 126 m off at the beginning, and no line said why."""
+    run = simulate_slowly(replace(BASE, duration_s=42.0), 2)
+    begun_ns = int(run.truth.stamps_ns[0])
+    dark_ns = [begun_ns + int(at_s * 1e9) for at_s in dark_s]
+    kept = tuple(
+        m
+        for m in run.recording.measurements
+        if not isinstance(m, GnssPosition) or not dark_ns[0] <= m.stamp_ns <= dark_ns[1]
+    )
+    told_ns = [m.stamp_ns for m in kept if isinstance(m, GnssPosition)]
+    said = app.smooth_recording(only(run.recording, kept), run.config).solution.stats.warnings
+    ends = [line for line in said if "nothing measures position or velocity" in line]
+    if dark_s[1] - dark_s[0] < 30.0:
+        assert ends == []
+        return
+    when = f"before {utc_text(min(told_ns))}" if dark_s[0] == 0.0 else f"after {utc_text(max(told_ns))}"
+    (line,) = ends
+    assert when in line
 
 
 def test_a_recorder_pause_cuts_the_run() -> None:

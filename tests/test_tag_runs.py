@@ -382,6 +382,20 @@ def test_tags_whose_faces_are_given_in_another_convention_are_named() -> None:
     assert "elsewhere than its mount says" not in said
 
 
+def test_tags_whose_faces_are_all_a_little_off_are_named_beside_the_mount() -> None:
+    """By 20 deg: no other convention, but no mount of the camera either, by which it was said that it looks 10 deg elsewhere."""
+
+    def turned(tag: TagConfig) -> TagConfig:
+        heading = float(np.degrees(np.arctan2(*tag.R_frame_tag[:2, 2])))
+        return tag.model_copy(update={"rpy_deg": None, "facing_deg": heading - 20.0})
+
+    said = dock(tag=turned, lasts_s=20.0, rate_hz=1.0, route_s=30.0).said
+    (line,) = (line for line in said.splitlines() if "elsewhere than its mount says" in line)
+    other = line.split("they all face ")[1]
+    assert float(other.split()[0]) == pytest.approx(20.0, abs=3.0)
+    assert " clockwise than the survey says" in other
+
+
 @pytest.mark.parametrize("swung_deg", [10.0, -10.0, 40.0, -40.0])
 def test_a_face_is_turned_by_more_than_a_heading_may_be_off(swung_deg: float, fixed: Docked) -> None:
     """A track that swings about the quay, its heading with it, shows each tag turned by as much: 10 deg are no other convention."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.interfaces import Nodetype
+from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig, VesselConfig, load_config
@@ -138,6 +139,7 @@ VELOCITIES: dict[str, tuple[dict[str, Any], float]] = {
         {"ins_status": 7, "position_type": 56, "north_velocity": 3.0, "east_velocity": -1.0, "up_velocity": -0.5, "east_velocity_std": 0.25, "up_velocity_std": 0.25},
         0.25,
     ),
+    SPAN + "INSPVA": ({"insstatus": 6, "velx": 3.0, "vely": -1.0, "velz": -0.5}, 0.3),
     SWRI + "NovatelVelocity": (
         {"solution_status": "SOL_COMPUTED", "velocity_type": "DOPPLER_VELOCITY", "horizontal_speed": 10.0**0.5, "track_ground": 341.565051177078, "vertical_speed": -0.5},
         0.3,
@@ -168,6 +170,7 @@ HEADINGS: dict[str, tuple[dict[str, Any], float]] = {
     OEM7 + "INSPVAX": ({"ins_status": {"status": 6}, "pos_type": {"type": 53}, "azimuth": 300.0, "azimuth_stdev": 0.5}, 0.5),
     OEM7 + "INSPVA": ({"status": {"status": 3}, "azimuth": 300.0}, 7.0),
     SPAN + "INSPVAX": ({"ins_status": 6, "position_type": 53, "azimuth": 300.0, "azimuth_std": 0.5}, 0.5),
+    SPAN + "INSPVA": ({"insstatus": 7, "azimuth": 300.0}, 7.0),
     SWRI + "NovatelHeading2": ({"solution_status": "SOL_COMPUTED", "position_type": "NARROW_INT", "heading": 300.0, "heading_sigma": 0.5}, 0.5),
     SWRI + "Inspvax": ({"ins_status": "INS_SOLUTION_FREE", "position_type": "INS_PSRDIFF", "azimuth": 300.0, "azimuth_std": 0.5}, 0.5),
     SWRI + "Inspva": ({"status": "INS_SOLUTION_GOOD", "azimuth": 300.0}, 7.0),
@@ -323,6 +326,7 @@ INVALID: list[tuple[str, str, dict[str, Any], str]] = [
     ("gnss_velocity", SPAN + "BESTVEL", {"position_type": 0}, "type none"),
     ("gnss", SPAN + "INSPVAX", {"ins_status": 2}, "ins_status 2"),
     ("compass", SPAN + "INSPVAX", {"position_type": 0}, "type none"),
+    ("gnss", SPAN + "INSPVA", {"insstatus": 2}, "ins_status 2"),
     ("gnss", SWRI + "NovatelPosition", {"solution_status": "INSUFFICIENT_OBS"}, "status INSUFFICIENT_OBS, type 50"),
     ("gnss", SWRI + "NovatelPosition", {"position_type": "NONE"}, "type none"),
     ("gnss", SWRI + "NovatelPosition", {"position_type": "OMNISTAR"}, "type OMNISTAR"),
@@ -682,9 +686,37 @@ def test_a_message_of_another_version_is_malformed_and_no_crash() -> None:
     letters, header = np.zeros(4, dtype=np.uint8), SimpleNamespace(week=2106, gpssec=1000)
     older = SimpleNamespace(header=header, status=letters, pos_type=letters, latitude=57.5, longitude=-11.25, velx=1.0)
     for part in VENDORS[SPAN + "INSPVAX"]:
-        with pytest.raises(TypeError, match="ins_status or status is no number: the message is of another version"):
+        with pytest.raises(
+            TypeError, match="ins_status or status or insstatus is no number: the message is of another version"
+        ):
             part.read(older)
     assert stamp_ns_of(older, SPAN + "INSPVAX", START_NS) == utc_ns("2020-05-16T23:59:43")
+
+
+def test_inspect_names_the_type_whose_definition_is_another_one(tmp_path: Path) -> None:
+    """A fork calls the velocities otherwise; and a message that was cut short. It was said that they 'cannot be decoded', and no more."""
+    make, msgtype = Messages(2), OEM7 + "BESTVEL"
+    fork = "std_msgs/Header header\nint32 sol_status\nint32 vel_type\nfloat64 hor_speed_kmh\nfloat64 trk_gnd\nfloat64 ver_speed\n"
+    make.store.register(get_types_from_msg(fork, msgtype))
+    items: list[Item] = []
+    for k in range(20):
+        at = START_NS + k * S // 10
+        msg = make.t[msgtype](
+            header=make.header(at), sol_status=0, vel_type=8, hor_speed_kmh=3.6, trk_gnd=0.0, ver_speed=0.0
+        )
+        items.append(("/bestvel", at, msg))
+    found = inspect_bag(write_bag(tmp_path / "run", make, items, "mcap"))
+    (line,) = (line for line in render(found).splitlines() if "cannot be decoded" in line)
+    assert line.startswith(
+        f"/bestvel: 20 messages cannot be decoded as {msgtype} (by its definition in the bag it is another version"
+    )
+    assert "hor_speed or hor_spd or horizontal_speed" in line
+
+
+def test_an_inspva_is_a_place_above_the_ellipsoid_without_an_accuracy() -> None:
+    found = read("gnss", SPAN + "INSPVA", {"insstatus": 3, "latitude": 57.5, "longitude": -11.25, "altitude": 41.5})
+    assert found.position == pytest.approx((57.5, -11.25, 41.5))
+    assert np.sqrt(np.diagonal(found.cov_enu_m2)) == pytest.approx([1.5, 1.5, 4.0])
 
 
 def test_a_point_is_a_place_without_an_accuracy() -> None:

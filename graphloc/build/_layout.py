@@ -19,6 +19,7 @@ from graphloc.config import SensorConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import InertialLink, InertialRow, Sensor, SlowProcess
 from graphloc.measurements import Measurement
+from graphloc.pauses import common_pauses, pauses_warning
 from graphloc.position_jumps import allowed_jump_m, position_jumps
 from graphloc.recording import Mounts, Recording
 from graphloc.time import stamps_of, utc_text
@@ -95,17 +96,24 @@ def make_problem(
     imu = usable_imu(recording, config, inertial.kind)
     t_body_imu, R = mount_of(imu.sensor, config.sensors[imu.sensor], recording.mounts)
 
-    def relink(imu_config: Any, noise_scale: float, R_body_imu: Array) -> InertialLink:
-        return inertial.link(imu, imu_config, R_body_imu, datum.gravity_mps2, noise_scale)
-
-    links = relink(config.sensors[imu.sensor], 1.0, R)
     inside, rejected, warnings = sorted_out(recording, config, {row.kind for row in rows}, imu)
-    warnings += _gap_warning(links.gaps())
-    timeline = make_timeline(int(imu.stamps_ns[0]), int(imu.stamps_ns[-1]), inside, config.timeline)
-    preintegrated = preintegrate(timeline, links)
     by_sensor: dict[str, list[Measurement]] = {}
     for m in inside:
         by_sensor.setdefault(m.sensor, []).append(m)
+    came = ([m for m in own if m.seq >= 0] for own in by_sensor.values())
+    pauses = common_pauses(imu.stamps_ns, (stamps_of(own) for own in came))
+
+    def relink(imu_config: Any, noise_scale: float, R_body_imu: Array) -> InertialLink:
+        links = inertial.link(imu, imu_config, R_body_imu, datum.gravity_mps2, noise_scale)
+        for pause in pauses:
+            links.pause(*pause)
+        return links
+
+    links = relink(config.sensors[imu.sensor], 1.0, R)
+    warnings += _gap_warning([gap for gap in links.gaps() if gap not in pauses])
+    warnings += [said for said in [pauses_warning(pauses)] if said]
+    timeline = make_timeline(int(imu.stamps_ns[0]), int(imu.stamps_ns[-1]), inside, config.timeline)
+    preintegrated = preintegrate(timeline, links)
     problem = Problem(
         config=config,
         datum=datum,

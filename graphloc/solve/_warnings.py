@@ -24,13 +24,14 @@ from graphloc.solve._imu_mount import MountError, mount_sigma_rad
 from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE, too_quiet
 from graphloc.solve._lasting import lasting
 from graphloc.solve._passes import expected_cost
-from graphloc.time import stamps_of, utc_text
+from graphloc.time import NS_PER_S, stamps_of, utc_text
 
 _TURNED, _TOLD = 2.5, 0.1  # sigmas; share of a prior's variance
 _MUCH_NOISIER = 1.5
 _SMALL_M = 0.1  # a slow error below it is that of RTK
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
 _BY_CHANCE = 1e-3
+_UNAIDED_S = 30.0  # at an end of the run, from which the IMU alone is metres off
 _LEVELS_M = 0.5  # sigma, for levels that may be the usual ones as well: said from there on
 
 
@@ -204,6 +205,7 @@ def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[
     warnings = list[str]()
     if not result.converged:
         warnings.append("the solver did not converge: the last pass still moved the track by centimetres or more")
+    warnings += _unaided_ends(problem)
     warnings += noise_warnings(problem, result)
     if expected > 0 and result.cost > CONTRADICTING_COST * expected:
         said = f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "
@@ -215,6 +217,22 @@ def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[
             f"and the bounds include {beside_m:.1f} m (1 sigma) for the others"
         )
     return warnings
+
+
+def _unaided_ends(problem: Problem) -> list[str]:
+    """Return a line on each end of the run at which nothing measures position or velocity for long, where the IMU alone carries the track."""
+    aided_ns = [m.stamp_ns for stream in problem.streams if stream.row.company for m in stream.measurements]
+    first_ns, last_ns = (int(stamp_ns) for stamp_ns in problem.timeline.stamps_ns[[0, -1]])
+    if not aided_ns:
+        return []
+    begun_ns, over_ns = min(aided_ns), max(aided_ns)
+    ends = [(begun_ns - first_ns, f"before {utc_text(begun_ns)}"), (last_ns - over_ns, f"after {utc_text(over_ns)}")]
+    return [
+        f"for {silent_ns * 1e-9:.0f} s, {when}, nothing measures position or velocity: the IMU alone carries the track there, and to it a "
+        "steady speed feels like rest, so that it may be far off though the vessel lies still; leave that part out (--start, --duration)"
+        for silent_ns, when in ends
+        if silent_ns > _UNAIDED_S * NS_PER_S
+    ]
 
 
 def noise_warnings(problem: Problem, result: BatchResult) -> list[str]:
