@@ -178,11 +178,19 @@ class _Underway:
         doubted = doubtful_returns(whole, self.solved.choice(), misfit)
         if doubted is None:
             return
-        cost, times = cost_of_run(whole, self.solved.settled.values, self.begun.prior), max(misfit, 1.0)
-        if self._more_probable(doubted.left_out_of(whole), cost - times * doubted.price(whole)):
-            off = doubted.still_off(whole, self.solved.choice())
-            left = self._more_probable(off.left_out_of(whole), cost - times * off.price(whole))
-            self._configured = (off if left else doubted).left_out_of(self._configured)
+        cost, times, before = self._cost(whole), max(misfit, 1.0), self._problem
+        if not self._more_probable(doubted.left_out_of(whole), cost - times * doubted.price(whole)):
+            return
+        off = doubted.still_off(whole, self.solved.choice(), self._cost(self._problem))
+        if off.each and self._more_probable(off.left_out_of(whole), cost - times * off.price(whole)):
+            self._configured = off.left_out_of(self._configured)
+        else:
+            del self.solved  # and its graph, before the next one is made
+            self._solve_first(before)
+
+    def _cost(self, problem: Problem) -> float:
+        """Return the cost (nats) of the solution by a problem with its measurements."""
+        return cost_of_run(problem, self.solved.settled.values, self.begun.prior)
 
     def take_jumps(self) -> None:
         """Solve it anew with the position jumps that the solution shows, while that is clearly more probable."""
@@ -190,7 +198,7 @@ class _Underway:
             jumping = with_jumps_off_track(self._problem, self.solved.settled.verdicts)
             if jumping is None:
                 return
-            cost = cost_of_run(self._problem, self.solved.settled.values, self.begun.prior)
+            cost = self._cost(self._problem)
             if not self._more_probable(jumping, cost - CLEARLY * (jumps_in(jumping) - jumps_in(self._problem))):
                 return
 
@@ -200,7 +208,7 @@ class _Underway:
         del self.solved  # and its graph, before the next one is made
         try:
             self._solve_first(other)
-            if cost_of_run(other, self.solved.settled.values, self.begun.prior) < lowest:
+            if self._cost(other) < lowest:
                 return True
         except SolveError:
             pass  # it cannot be solved so

@@ -12,9 +12,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graphloc.build import Problem, Stream
+from graphloc.frames import Array
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.position_jumps import MEAN_S
 from graphloc.solve._decide import Verdicts, far_sigmas, met
@@ -24,7 +24,7 @@ from graphloc.time import NS_PER_S, stamps_of, utc_text
 
 _CONVERGES_S = 40.0  # for so long after an outage its fixes are doubted
 _STILL = 1.5  # as what is far off converges, it is off for longer
-_RIGHT = 1.5  # nats that a right fix costs, half of its axes
+_RIGHT = 1.5  # nats that a right fix costs at least, half of its axes
 _FAR = 2.0  # sigmas, of fix and slow error, off the track: nearer, a fix has converged
 
 
@@ -41,10 +41,6 @@ class Return(NamedTuple):
     fixes: range
     off_m: float = 0.0
 
-    def price(self, stream: Stream) -> float:
-        """Return what it costs (nats) to leave them out: that a receiver comes back off, for how long, and what right ones would cost."""
-        return COMES_BACK_OFF + self._lasts_s(stream) / MEAN_S + _RIGHT * len(self.fixes)
-
     def said(self, stream: Stream) -> str:
         """Say it, for the user."""
         began, back = self.outage_ns
@@ -54,23 +50,30 @@ class Return(NamedTuple):
             else "at first"
         )
         return (
-            f"{stream.name}: {when} it was up to {self.off_m:.0f} m off, and converged within {self._lasts_s(stream):.0f} s: "
+            f"{stream.name}: {when} it was up to {self.off_m:.0f} m off, and converged within {self.lasts_s(stream):.0f} s: "
             f"its {len(self.fixes)} fixes of that time are left out"
         )
 
-    def _lasts_s(self, stream: Stream) -> float:
+    def lasts_s(self, stream: Stream) -> float:
         return (stream.measurements[self.fixes[-1]].stamp_ns - self.outage_ns[1]) / NS_PER_S
 
 
 class Returns(NamedTuple):
-    """Returns of one receiver, by the number of its stream."""
+    """Returns of one receiver.
+
+    Attributes:
+        number: of its stream. usual: cost (nats) that comes with each of its other fixes.
+    """
 
     number: int
+    usual: float
     each: tuple[Return, ...]
 
     def price(self, problem: Problem) -> float:
-        """Return what it costs (nats) to leave all of them out."""
-        return sum(one.price(self._stream(problem)) for one in self.each)
+        """Return what it costs (nats) to leave them out: that a receiver comes back off, for how long, and what such fixes cost anyway."""
+        lasts_s = sum(one.lasts_s(self._stream(problem)) for one in self.each)
+        fixes = sum(len(one.fixes) for one in self.each)
+        return COMES_BACK_OFF * len(self.each) + lasts_s / MEAN_S + self.usual * fixes
 
     def _stream(self, problem: Problem) -> Stream:
         return next(s for s in problem.streams if s.number == self.number)
@@ -93,8 +96,12 @@ class Returns(NamedTuple):
             warnings=(*problem.warnings, *(one.said(stream) for one in self.each if one.off_m)),
         )
 
-    def still_off(self, problem: Problem, without: RunChoice) -> Returns:
-        """Return of their fixes those that a solution without them shows to be far off, all before them, and some after them."""
+    def still_off(self, problem: Problem, without: RunChoice, cost: float) -> Returns:
+        """Return of their fixes those that a solution without them shows to be far off, all before them, and some after them.
+
+        Args:
+            cost: of that solution, nats. Where its own fixes bend it as well, or it takes them for off, it is no merit that these do not.
+        """
         stream, found = self._stream(problem), list[Return]()
         stamps_ns = stamps_of(stream.measurements)
         for one in self.each:
@@ -105,7 +112,11 @@ class Returns(NamedTuple):
                 since_ns = stamps_ns[one.fixes] - one.outage_ns[1]
                 count = int(np.searchsorted(since_ns, _STILL * since_ns[far[-1]], side="right"))
                 found.append(Return(one.outage_ns, one.fixes[:count], float(off_m[far].max())))
-        return self._replace(each=tuple(found))
+        others = sum(
+            float(_costs(s, without.verdicts).sum()) for s in without.problem.streams if s.number != self.number
+        )
+        left = len(self._stream(without.problem).measurements)
+        return Returns(self.number, max((cost - others) / left, _RIGHT), tuple(found))
 
 
 def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Returns | None:
@@ -120,13 +131,17 @@ def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Retu
     if len(absolute) != 1 or absolute[0].row.false is not None:
         return None
     (stream,) = absolute
+    cost = _costs(stream, solved.verdicts)
     least = COMES_BACK_OFF * max(misfit, 1.0)
-    returns = [
-        one
-        for one in _returns(stream)
-        if _excess(problem, stream, one, solved) > least or _taken_for_off(stream, one.fixes, solved.verdicts)
-    ]
-    return Returns(stream.number, tuple(returns)) if returns else None
+
+    def may_be_off(one: Return) -> bool:
+        steps = range(problem.timeline.floor(one.outage_ns[0]), int(stream.state[one.fixes[-1]]))
+        bent = sum(problem.inertial[k].error(solved.values) for k in steps)
+        dear = bent + float(np.sum(cost[one.fixes] - _RIGHT)) > least
+        return dear or any(far_sigmas(stream.slow, solved.verdicts[stream.number, i].at) > _FAR for i in one.fixes)
+
+    returns = tuple(filter(may_be_off, _returns(stream)))
+    return Returns(stream.number, _RIGHT, returns) if returns else None
 
 
 def _returns(stream: Stream) -> list[Return]:
@@ -139,23 +154,13 @@ def _returns(stream: Stream) -> list[Return]:
     return [Return((int(stamps_ns[max(a - 1, 0)]), int(stamps_ns[a])), range(a, b)) for a, b in pairs if b > a]
 
 
-def _excess(problem: Problem, stream: Stream, one: Return, solved: RunChoice) -> float:
-    """Return by how much the IMU and the fixes cost more (nats) than they should from the beginning of an outage to the last of the fixes."""
-    steps = range(problem.timeline.floor(one.outage_ns[0]), int(stream.state[one.fixes[-1]]))
-    bent = sum(problem.inertial[k].error(solved.values) for k in steps)
-    return _cost_of_fixes(stream, one.fixes, solved.verdicts) + float(bent)
+def _costs(stream: Stream, verdicts: Verdicts) -> Array:
+    """Return the cost (M,) of each measurement, nats."""
+    residuals = [verdicts[stream.number, i].residual for i in range(len(stream.measurements))]
+    return np.array([stream.config.kernel.loss(r.nis(), len(r.raw)) for r in residuals])
 
 
-def _cost_of_fixes(stream: Stream, fixes: range, verdicts: Verdicts) -> float:
-    residuals = [verdicts[stream.number, i].residual for i in fixes]
-    return sum(stream.config.kernel.loss(r.nis(), len(r.raw)) - _RIGHT for r in residuals)
-
-
-def _taken_for_off(stream: Stream, fixes: range, verdicts: Verdicts) -> bool:
-    return any(far_sigmas(stream.slow, verdicts[stream.number, i].at) > _FAR for i in fixes)
-
-
-def _sigma_m(stream: Stream, cov: NDArray[np.float64]) -> float:
+def _sigma_m(stream: Stream, cov: Array) -> float:
     """Return how far a fix may be off by its covariance (3, 3), m^2, and its slow error, m."""
     slow = stream.slow or stream.left_out
     usual = 0.0 if slow is None else float(np.abs(slow.sigma * slow.scale)[slow.far_axes].max(initial=0.0))
