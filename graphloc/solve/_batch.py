@@ -6,10 +6,9 @@
    new in a window are judged by the prediction without them, with its covariance (`_grow`). Both on a
    thinned run (`graphloc.build.thinned`). Passes over all of it remove the seams: there they cost a fifth.
 3. Passes over the whole run: modes and weights re-chosen until they no longer change (`_passes`).
-4. Try other choices that may be more probable (`_choices`), and repeat 3 where there are any. Where the first fixes after an
-   outage bend the track, 1 to 4 are repeated without them (`_returns`). Where it shows position
-   jumps of the only position sensor, 1 to 4 are repeated with them (`_jumps`). Where the IMU's mount is clearly off, repeat 3 with it
-   turned (`_imu_mount`).
+4. Try other choices that may be more probable (`_choices`), and repeat 3 where there are any. Where that shows position
+   jumps of the only position sensor, 1 to 4 are repeated with them (`_jumps`); where the first fixes after an outage bend the track,
+   without these (`_returns`). Where the IMU's mount is clearly off, repeat 3 with it turned (`_imu_mount`).
 5. Where receivers jump and no other sensor measures position, choose the most probable level (`_levels`).
 6. A Bayes tree of the last graph gives the covariances of every state.
 
@@ -87,12 +86,13 @@ def solve_batch(
     newest: bool = False,
     doubt_imu: bool = False,
     near_rad: float | None = None,
+    doubt_returns: bool = True,
 ) -> BatchResult:
     """Solve a whole run.
 
     Args:
         newest: `heading_var` is asked for at the last state alone.
-        doubt_imu: whether to look for spans in which the IMU is wrong.
+        doubt_imu: whether to look for spans in which the IMU is wrong. doubt_returns: for fixes after outages that lead astray.
         near_rad: yaw at the start, if the motion alone tells it: the only one that is tried.
 
     Raises:
@@ -102,14 +102,15 @@ def solve_batch(
     run = _Underway(problem, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
     run.raise_noise_of_sensors()
     if not newest:
-        run.leave_out_returns()
         run.take_jumps()
+        if doubt_returns:
+            run.leave_out_returns()
         run.estimate_mount()
     noisier = run.raise_imu_noise()
     if noisier is not None:
         stated = run.stated
         del run  # and its graph, before the next one is made
-        again = solve_batch(noisier, progress, newest=newest)
+        again = solve_batch(noisier, progress, newest=newest, doubt_returns=False)
         return replace(again, stated=with_jumps_of(again.stated, stated))
     return run.at_usual_level()
 
@@ -171,8 +172,18 @@ class _Underway:
             del self.solved  # and its graph, before the next one is made
             self._solve_first(replace(with_sensor_noise(problem, times), usual_motion=None))
 
+    def take_jumps(self) -> None:
+        """Solve it anew with the position jumps that the solution shows, while that is clearly more probable."""
+        for _ in range(_MAX_JUMP_ROUNDS):
+            jumping = with_jumps_off_track(self._problem, self.solved.settled.verdicts)
+            if jumping is None:
+                return
+            cost = self._cost(self._problem)
+            if not self._more_probable(jumping, cost - CLEARLY * (jumps_in(jumping) - jumps_in(self._problem))):
+                return
+
     def leave_out_returns(self) -> None:
-        """Solve it anew without the first fixes after outages, if that is clearly more probable."""
+        """Solve it anew without the first fixes after outages, if that is clearly more probable; not where the receiver jumps."""
         # With the noise that the sensors were found to have: else it would be saved with their fixes.
         whole, misfit = replace(self.solved.problem, usual_motion=None), self.solved.misfit()
         doubted = doubtful_returns(whole, self.solved.choice(), misfit)
@@ -191,16 +202,6 @@ class _Underway:
     def _cost(self, problem: Problem) -> float:
         """Return the cost (nats) of the solution by a problem with its measurements."""
         return cost_of_run(problem, self.solved.settled.values, self.begun.prior)
-
-    def take_jumps(self) -> None:
-        """Solve it anew with the position jumps that the solution shows, while that is clearly more probable."""
-        for _ in range(_MAX_JUMP_ROUNDS):
-            jumping = with_jumps_off_track(self._problem, self.solved.settled.verdicts)
-            if jumping is None:
-                return
-            cost = self._cost(self._problem)
-            if not self._more_probable(jumping, cost - CLEARLY * (jumps_in(jumping) - jumps_in(self._problem))):
-                return
 
     def _more_probable(self, other: Problem, lowest: float) -> bool:
         """Return whether another problem costs less (nats) than the lowest; else the solution stays what it was."""

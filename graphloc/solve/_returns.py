@@ -29,11 +29,10 @@ _FAR = 2.0  # sigmas, of fix and slow error, off the track: nearer, a fix has co
 
 
 class Return(NamedTuple):
-    """The fixes of a receiver after an outage, or its first ones.
+    """The fixes of a receiver after an outage.
 
     Attributes:
-        outage_ns: stamps of the last fix before it (of the first one where there is none) and of the first one after it.
-        fixes: their indices in the stream.
+        outage_ns: stamps of the last fix before it and of the first one after it. fixes: their indices in the stream.
         off_m: by how much they are off at most; 0: not known.
     """
 
@@ -44,14 +43,9 @@ class Return(NamedTuple):
     def said(self, stream: Stream) -> str:
         """Say it, for the user."""
         began, back = self.outage_ns
-        when = (
-            f"back from an outage of {(back - began) / NS_PER_S:.0f} s at {utc_text(back)}"
-            if back > began
-            else "at first"
-        )
         return (
-            f"{stream.name}: {when} it was up to {self.off_m:.0f} m off, and converged within {self.lasts_s(stream):.0f} s: "
-            f"its {len(self.fixes)} fixes of that time are left out"
+            f"{stream.name}: back from an outage of {(back - began) / NS_PER_S:.0f} s at {utc_text(back)} it was up to {self.off_m:.0f} m "
+            f"off, and converged within {self.lasts_s(stream):.0f} s: its {len(self.fixes)} fixes of that time are left out"
         )
 
     def lasts_s(self, stream: Stream) -> float:
@@ -84,7 +78,7 @@ class Returns(NamedTuple):
         gone = np.array([i for one in self.each for i in one.fixes], dtype=np.int64)
         kept = stream.only(np.setdiff1d(np.arange(len(stream.measurements)), gone))
         lost = [stream.measurements[i] for i in gone]
-        why = "at first, or after an outage, the receiver was off, and converged"
+        why = "after an outage the receiver was off, and converged"
         rows = [
             LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic="", outcome=Outcome.REJECTED, reason=why)
             for m in lost
@@ -128,7 +122,7 @@ def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Retu
         misfit: of the solution: as much as anywhere tells nothing.
     """
     absolute = [s for s in problem.streams if s.row.absolute]
-    if len(absolute) != 1 or absolute[0].row.false is not None:
+    if len(absolute) != 1 or absolute[0].row.false is not None or len(absolute[0].position_jumps[0]):
         return None
     (stream,) = absolute
     cost = _costs(stream, solved.verdicts)
@@ -146,12 +140,12 @@ def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Retu
 
 def _returns(stream: Stream) -> list[Return]:
     stamps_ns = stamps_of(stream.measurements)
-    back = np.flatnonzero(np.diff(stamps_ns, prepend=-np.inf) > OUTAGE_S * NS_PER_S)
+    back = np.flatnonzero(np.diff(stamps_ns) > OUTAGE_S * NS_PER_S) + 1
     ends = np.searchsorted(stamps_ns, stamps_ns[back] + int(_CONVERGES_S * NS_PER_S))
     # Some fixes must tell the place afterwards, before the next outage.
     until = np.minimum(ends, np.append(back[1:], len(stamps_ns)) - 1)
     pairs = zip(back.tolist(), until.tolist(), strict=True)
-    return [Return((int(stamps_ns[max(a - 1, 0)]), int(stamps_ns[a])), range(a, b)) for a, b in pairs if b > a]
+    return [Return((int(stamps_ns[a - 1]), int(stamps_ns[a])), range(a, b)) for a, b in pairs if b > a]
 
 
 def _costs(stream: Stream, verdicts: Verdicts) -> Array:
