@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -129,21 +130,44 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
         middle = middle[good]
         along = (moved * np.conj(chord / np.maximum(np.abs(chord), MOVES_M)))[good].real
         parts = [_felt_along(felt, at, motion.speed_mps, middle, half_s, lag) for lag in lags]
-        alone = max(_explained(along, own, swung, np.inf) for own, swung in parts)
-        held = (1.0 - alone**2) * float(along.var()) * len(along) / windows / _HIGH_M**2
-        c = np.array([_explained(along, *part, held) for part in parts])
-        k = int(c.argmax())
-        bend = 0.0 if k in (0, len(c) - 1) else float(2.0 * c[k] - c[k - 1] - c[k + 1]) / _APART_S**2
-        if bend <= 0.0 or c[k] <= 0.0:
+        whole = _best_lag(along, parts, lags, windows)
+        if whole is None:
             continue
-        value = float(lags[k]) + float(c[k + 1] - c[k - 1]) / (2.0 * _APART_S * bend)
-        left = max(1.0 - float(c[k]) ** 2, 1e-9)
-        better = windows * (float(c[k]) ** 2 - float(np.interp(0.0, lags, c)) ** 2) / left
-        found.append((better, value, float(np.sqrt(left / (windows * c[k] * bend)))))
+        better, value, sigma = whole
+        # A jump of the fixes is an acceleration that some lag fits by chance; how much that tells differs from block to block.
+        block = (middle - middle[0]) // _BLOCK_S
+        rest = [block != k for k in np.unique(block)]
+        if len(rest) > 2:
+            without = [_best_lag(along[r], [(a[r], b[r]) for a, b in parts], lags, windows * r.mean()) for r in rest]
+            values = np.array([np.inf if one is None else one[1] for one in without])
+            scatter = np.sqrt((len(rest) - 1) * np.var(values)) if np.isfinite(values).all() else np.inf
+            sigma = max(sigma, float(scatter))
+        found.append((better, value, sigma))
     if not found:
         return None
     better, value, sigma = max(found)
     return MotionOffset(value, sigma, better > _CLEAR**2 and abs(value) > max(_CLEAR * sigma, _LEAST_OF_WAY_S))
+
+
+def _best_lag(
+    along: Array, parts: Sequence[tuple[Array, Array]], lags: Array, windows: float
+) -> tuple[float, float, float] | None:
+    """Return by how much chi-square is better with the best offset than with none, that offset, and its sigma, s; None where there is none.
+
+    Args:
+        along: (N,) accelerations. parts: for each of the lags, what is felt and the swing (N,). windows: how many of the N are not alike.
+    """
+    alone = max(_explained(along, own, swung, np.inf) for own, swung in parts)
+    held = (1.0 - alone**2) * float(along.var()) * len(along) / windows / _HIGH_M**2
+    c = np.array([_explained(along, *part, held) for part in parts])
+    k = int(c.argmax())
+    bend = 0.0 if k in (0, len(c) - 1) else float(2.0 * c[k] - c[k - 1] - c[k + 1]) / _APART_S**2
+    if bend <= 0.0 or c[k] <= 0.0:
+        return None
+    value = float(lags[k]) + float(c[k + 1] - c[k - 1]) / (2.0 * _APART_S * bend)
+    left = max(1.0 - float(c[k]) ** 2, 1e-9)
+    better = windows * (float(c[k]) ** 2 - float(np.interp(0.0, lags, c)) ** 2) / left
+    return better, value, float(np.sqrt(left / (windows * c[k] * bend)))
 
 
 def later_than(fixes: MeasuredMotion, velocity: MeasuredMotion) -> tuple[float, float] | None:

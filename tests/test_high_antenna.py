@@ -62,3 +62,21 @@ def test_fixes_once_a_second_are_not_asked_in_between(seed: int) -> None:
     offset = motion_time_offset(felt, MeasuredMotion("fixes", 0, at, np.full(len(at), 1.0), measured + 0j))
     assert offset is not None
     assert abs(offset.value_s) < 3.0 * offset.sigma_s
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_stretch_of_a_run_tells_no_delay(seed: int) -> None:
+    """A car that brakes hard once, where its fixes come late by chance (a jump to and fro), and goes on gently, with fixes in time."""
+    rng, t = np.random.default_rng(seed), np.arange(0.0, 240.0, 0.01)
+    gently = gaussian_filter1d(np.repeat(rng.uniform(7.0, 9.0, 24), 1000), 250.0)
+    braking = 6.0 * np.exp(-(((t - 110.0) / 1.5) ** 2))
+    zero = np.zeros(len(t))
+    accel = np.column_stack([np.gradient(gently - braking, 0.01), zero, zero + G]) + 0.1 * rng.normal(size=(len(t), 3))
+    felt = Felt.of((t * 1e9).astype(np.int64), accel, 0.003 * rng.normal(size=(len(t), 3)), G)
+    at = np.arange(0.3, 239.0, 0.2)
+    place = np.interp(at, t, np.cumsum(gently) * 0.01) - np.interp(at - 0.4, t, np.cumsum(braking) * 0.01)
+    measured = place + 0.1 * rng.normal(size=len(at))
+    offset = motion_time_offset(felt, MeasuredMotion("fixes", 0, at, np.full(len(at), 8.0), measured + 0j))
+    assert offset is not None
+    assert offset.value_s == pytest.approx(-0.4, abs=0.1)  # as it looks
+    assert not offset.clear
