@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -25,6 +26,7 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Recording
 from graphloc.solution import Cause, Health, Solution
+from graphloc.solve._levels import _drawn_anew
 from graphloc.trajectory import bounds_95
 from tests.bagfactory import S
 from tests.faults import arrivals_of, feed
@@ -314,3 +316,22 @@ def test_one_receiver_is_one_witness_against_another() -> None:
     (said,) = (reason for reason in verdict(app.report_data(beside)).reasons if "of stern" in reason.text)
     assert said.trust is Trust.NO
     assert "this run does not tell which" in said.text
+
+
+def test_receivers_that_lose_rtk_together_may_be_lost_again_apart() -> None:
+    """Both are silent from 10 s to 20 s, and the first one again, so that only its next level ends before the run does."""
+    stamps = [[*range(11), *range(20, 31), *range(40, 51)], [*range(11), *range(20, 51)]]
+    streams = [
+        SimpleNamespace(number=n, measurements=[SimpleNamespace(stamp_ns=t * S) for t in own], anew=np.array(anew))
+        for n, (own, anew) in enumerate(zip(stamps, ([10, 30], [10]), strict=True))
+    ]
+    timeline = SimpleNamespace(slow_stamps_ns=np.arange(51) * S)
+    case: Any = SimpleNamespace(
+        streams=streams, problem=SimpleNamespace(timeline=timeline), levels=lambda _span: [np.ones(3)]
+    )
+    spans = _drawn_anew(case)
+    assert sorted((span.of, span.gap_ns[0] // S, span.until_ns) for span in spans if span.of == 0) == [
+        (0, 10, 30 * S),
+        (0, 30, None),
+    ]
+    assert [(span.gap_ns, span.until_ns) for span in spans if span.of == 1] == [((10 * S, 20 * S), None)]

@@ -170,7 +170,7 @@ def _drawn_anew(case: _Case) -> list[_Span]:
             found.append(_Span(gap_ns, gap_ns[1], next_ns and next_ns[0], of=stream.number, back_ns=next_ns))
     found = [span for span in found if case.levels(span)]
     longest = sorted(found, key=lambda span: span.gap_ns[1] - span.gap_ns[0])[-_MOST_OUTAGES:]
-    return sorted(longest)
+    return sorted(longest, key=lambda span: span.gap_ns)
 
 
 def _after_outage(
