@@ -26,6 +26,7 @@ _NEAR_S = 1.0  # sensors' stamps may be off by so much, and their own pauses
 _FEWEST = 5  # steps that tell a sensor's period
 _REGULAR = 1.5  # times the median step, at the 90 % point
 _OFF_P, _OFF_G = 0.25, 0.1  # share of the period, and of the pause, by which a sensor's own pause may be off
+_OFF_NONE = 0.5  # at most this share of the pause
 
 
 def common_pauses(imu_ns: Stamps, others_ns: Iterable[Stamps]) -> list[tuple[int, int]]:
@@ -78,4 +79,6 @@ def _pauses(own_ns: Stamps, period_ns: float, start_ns: int, stop_ns: int, usual
     set_ns = stop_ns - start_ns - usual_ns
     if not len(steps) or steps.max() > 2.0 * period_ns + set_ns + near:
         return None
-    return bool(abs(steps.max() - period_ns - set_ns) < _OFF_P * period_ns + _OFF_G * set_ns)
+    # Nearer to the pause than to none: else a short one of the IMU alone would be one of each sensor that comes rarely.
+    off_ns = min(_OFF_P * period_ns + _OFF_G * set_ns, _OFF_NONE * set_ns)
+    return bool(abs(steps.max() - period_ns - set_ns) < off_ns)

@@ -68,6 +68,13 @@ def test_where_the_imu_pauses_alone_or_nothing_else_tells_it_is_none() -> None:
     assert len(common_pauses(imu, [later(every(0.1)), gone[gone < 20 * S]])) == 1  # a sensor that had long been off
 
 
+@pytest.mark.parametrize("period_s", [1.0, 5.0])
+def test_a_short_pause_of_the_imu_alone_is_none_of_a_sensor_that_comes_rarely(period_s: float) -> None:
+    fixes = every(period_s, 0.21)
+    assert common_pauses(without(every(0.01), 0.2), [np.rint(fixes * S).astype(np.int64)]) == []
+    assert len(common_pauses(later(every(0.01), 0.2), [later(fixes, 0.2)])) == 1
+
+
 def test_across_a_pause_a_vessel_may_not_have_moved() -> None:
     """0.4 s at 3 m/s along y and 0.2 rad/s: 1.2 m and 0.08 rad, 1 sigma, and a tenth of it across; elsewhere as without."""
     stamps = later(every(0.01))
