@@ -71,3 +71,13 @@ def test_fixes_of_a_receiver_that_comes_back_right_are_used(run: SimulatedRun) -
     solution = _smoothed(run, 0.0)
     assert not [row for row in solution.ledger if row.sensor == "gnss" and row.outcome is Outcome.REJECTED]
     assert not [w for w in solution.stats.warnings if "back from an outage" in w]
+
+
+def test_right_fixes_are_used_where_it_is_the_imu_that_is_off(run: SimulatedRun) -> None:
+    """Its bias steps by 20 mg in the outage: solved without the fixes, the track is off till the next one that is used."""
+    imu = run.recording.imu
+    assert imu is not None
+    late = (imu.stamps_ns - imu.stamps_ns[0])[:, None] * 1e-9 > 0.5 * sum(_OUTAGE_S)
+    stepped = replace(imu, accel_mps2=imu.accel_mps2 + late * [0.2, 0.0, 0.0])
+    solution = _smoothed(replace(run, recording=replace(run.recording, imu=stepped)), 0.0)
+    assert not [row for row in solution.ledger if row.sensor == "gnss" and row.outcome is Outcome.REJECTED]

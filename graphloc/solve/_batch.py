@@ -190,6 +190,8 @@ class _Underway:
         if doubted is None:
             return
         cost, times, before = self._cost(whole), max(misfit, 1.0), self._problem
+        # What the IMU is off by without fixes is no reason to doubt it.
+        self._solve = partial(self._solve, doubt_imu=False)
         if not self._more_probable(doubted.left_out_of(whole), cost - times * doubted.price(whole)):
             return
         off = doubted.still_off(whole, self.solved.choice(), self._cost(self._problem))

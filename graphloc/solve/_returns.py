@@ -22,7 +22,8 @@ from graphloc.solve._final_passes import RunChoice
 from graphloc.solve._levels import COMES_BACK_OFF, OUTAGE_S
 from graphloc.time import NS_PER_S, stamps_of, utc_text
 
-_CONVERGES_S = 40.0  # for so long after an outage its fixes are doubted
+_CONVERGES_S = 60.0  # for so long after an outage its fixes are doubted
+_CONVERGED = 0.75  # of that time, in which it must have
 _STILL = 1.5  # as what is far off converges, it is off for longer
 _RIGHT = 1.5  # nats that a right fix costs at least, half of its axes
 _FAR = 2.0  # sigmas, of fix and slow error, off the track: nearer, a fix has converged
@@ -105,7 +106,9 @@ class Returns(NamedTuple):
             if len(far):
                 since_ns = stamps_ns[one.fixes] - one.outage_ns[1]
                 count = int(np.searchsorted(since_ns, _STILL * since_ns[far[-1]], side="right"))
-                found.append(Return(one.outage_ns, one.fixes[:count], float(off_m[far].max())))
+                # Where it is the IMU that is off, the track is off nearly till the next fix that is used.
+                if since_ns[far[-1]] < _CONVERGED * since_ns[-1]:
+                    found.append(Return(one.outage_ns, one.fixes[:count], float(off_m[far].max())))
         others = sum(
             float(_costs(s, without.verdicts).sum()) for s in without.problem.streams if s.number != self.number
         )
@@ -129,6 +132,9 @@ def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Retu
     least = COMES_BACK_OFF * max(misfit, 1.0)
 
     def may_be_off(one: Return) -> bool:
+        end_ns = stream.measurements[one.fixes[-1]].stamp_ns
+        if any(after_ns < end_ns and one.outage_ns[0] < until_ns for after_ns, until_ns in problem.left_out):
+            return False  # the IMU was wrong there, and may still be
         steps = range(problem.timeline.floor(one.outage_ns[0]), int(stream.state[one.fixes[-1]]))
         bent = sum(problem.inertial[k].error(solved.values) for k in steps)
         dear = bent + float(np.sum(cost[one.fixes] - _RIGHT)) > least
@@ -142,8 +148,8 @@ def _returns(stream: Stream) -> list[Return]:
     stamps_ns = stamps_of(stream.measurements)
     back = np.flatnonzero(np.diff(stamps_ns) > OUTAGE_S * NS_PER_S) + 1
     ends = np.searchsorted(stamps_ns, stamps_ns[back] + int(_CONVERGES_S * NS_PER_S))
-    # Some fixes must tell the place afterwards, before the next outage.
-    until = np.minimum(ends, np.append(back[1:], len(stamps_ns)) - 1)
+    # A third of them must tell the place afterwards, before the next outage.
+    until = np.minimum(ends, back + 2 * np.diff(back, append=len(stamps_ns)) // 3)
     pairs = zip(back.tolist(), until.tolist(), strict=True)
     return [Return((int(stamps_ns[a - 1]), int(stamps_ns[a])), range(a, b)) for a, b in pairs if b > a]
 
