@@ -15,12 +15,8 @@ from numpy.typing import NDArray
 
 from graphloc.time import NS_PER_S, duration_ns, utc_text
 
-LEAST_PAUSE_S = 0.1
-"""A shorter pause is none: of a fast vessel, a metre."""
-PAUSE_TOLD_S = 3.0
-"""How long after a pause a sensor's message may come that tells of it."""
-
 Stamps = NDArray[np.int64]
+_LEAST_S = 0.1  # a shorter pause is none: of a fast vessel, a metre
 _LEAST_STEPS = 5.0  # of a pause, of the usual steps of the IMU
 _NEAR_S = 1.0  # sensors' stamps may be off by so much, and their own pauses
 _FEWEST = 5  # steps that tell a sensor's period
@@ -37,7 +33,7 @@ def common_pauses(imu_ns: Stamps, others_ns: Iterable[Stamps]) -> list[tuple[int
     """
     steps = np.diff(imu_ns)
     usual = float(np.median(steps)) if len(steps) else 0.0
-    wide = np.flatnonzero(steps > max(_LEAST_STEPS * usual, duration_ns(LEAST_PAUSE_S)))
+    wide = np.flatnonzero(steps > max(_LEAST_STEPS * usual, duration_ns(_LEAST_S)))
     regular = [(np.sort(own), period) for own in others_ns if (period := _period_ns(own))] if len(wide) else []
     found = []
     for n in wide.tolist():
@@ -57,7 +53,7 @@ def pauses_warning(pauses: Sequence[tuple[int, int]]) -> str:
     first = "" if len(pauses) == 1 else "the first time "
     return (
         f"all sensors pause {which}, {first}at {utc_text(pauses[0][0])}: either nothing was recorded meanwhile, or the computer's clock, "
-        "which stamps them all, was set forward and no time passed; the bounds there allow for both"
+        "which stamps them all, jumped forward and no time passed; the bounds of an offline run there allow for both"
     )
 
 

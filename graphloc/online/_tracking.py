@@ -33,7 +33,6 @@ from graphloc.online._propagate import advance_odometry, propagate, unpropagated
 from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
-from graphloc.pauses import LEAST_PAUSE_S, PAUSE_TOLD_S, common_pauses, pauses_warning
 from graphloc.solve._wrong_imu import WHY
 from graphloc.time import duration_ns, stamps_of, utc_text
 from graphloc.trajectory import Trajectory
@@ -74,12 +73,6 @@ class Tracking:
         self._pending: list[Measurement] = []  # ahead of the IMU, by stamp
         self._unread: list[ImuSample] = []  # not yet handed to the window
         self._holes: list[tuple[int, int]] = []  # stamps (ns) between which samples came late
-        self._pauses: list[tuple[int, int]] = []  # of all sensors at once, stamps (ns)
-        self._told_pauses: list[tuple[int, int]] = []  # those that are not said yet
-        self._read_ns, self._pause_until_ns = (
-            0,
-            0,
-        )  # the newest sample that was read; until when messages may tell of a pause
         self._height_due_ns: dict[str, int] = {}  # of the next configured height, by sensor
         self._recent, self._doubt = Recent(), ImuDoubt()
         self._held_out: list[ImuSample] = []  # left out since the last gap began, or went on
@@ -118,8 +111,6 @@ class Tracking:
         )
         for gap in self._doubt.gaps:
             problem.links.leave_out(*gap)
-        for pause in self._pauses:
-            problem.links.pause(*pause)
         if before is not None:
             for name, stream in problem.streams.items():
                 was = before.problem.streams[name]
@@ -224,28 +215,10 @@ class Tracking:
             stamps = stamps_of(self._unread)
             readings = np.array([np.hstack([m.accel_mps2, m.gyro_radps]) for m in self._unread])
             self.lag.problem.links.extend(stamps, readings)
-            if self._read_ns and np.diff(stamps, prepend=self._read_ns).max() > duration_ns(LEAST_PAUSE_S):
-                self._pause_until_ns = int(stamps.max()) + duration_ns(PAUSE_TOLD_S)
-            self._read_ns, self._unread = int(stamps.max()), []
+            self._unread = []
         if self._holes:
             holes, self._holes = self._holes, []
             self.lag.reintegrate(holes)
-        if self._read_ns < self._pause_until_ns and (pauses := self._new_pauses()):
-            self.lag.reintegrate(pauses)
-            self.lag.commit()  # what comes next is judged by the prediction across them
-
-    def _new_pauses(self) -> list[tuple[int, int]]:
-        """Return the pauses of all sensors that are newly shown, as stamps (ns), and let the links allow for them."""
-        by_sensor: dict[str, list[Measurement]] = {}
-        for m in self._recent.others():
-            by_sensor.setdefault(m.sensor, []).append(m)
-        known = common_pauses(stamps_of(self._recent.samples()), [stamps_of(own) for own in by_sensor.values()])
-        new = [pause for pause in known if pause not in self._pauses]
-        for pause in new:
-            self.lag.problem.links.pause(*pause)
-        self._pauses = [pause for pause in self._pauses if pause[1] >= self.lag.first_ns] + new
-        self._told_pauses += new
-        return new
 
     def solve_late_imu(self) -> None:
         """Solve with the IMU samples that came late since the newest state: it was predicted across the holes that they fill."""
@@ -383,10 +356,8 @@ class Tracking:
         fits = (
             [Event(f"{self._setup.imu_name}: its samples fit again", warns=False)] if self._doubt.ended(at_ns) else []
         )
-        told, self._told_pauses = self._told_pauses, []
         return [
             *heading,
-            *([Event(pauses_warning(told))] if told else []),
             *frozen,
             *thawed,
             *fits,
