@@ -37,7 +37,7 @@ from graphloc.solve import _batch, _first_solution, _grow
 from graphloc.solve._decide import Stage, _by_kernel, weigh
 from graphloc.solve._first_solution import first_solution
 from graphloc.solve._grow import grow
-from graphloc.solve._jumps import with_jumps_off_track
+from graphloc.solve._jumps import jumps_in, with_jumps_off_track
 from graphloc.solve._stretch import StretchStep, solve_stretch
 from tests.slowly import simulate_slowly, with_few_states
 
@@ -616,6 +616,18 @@ def test_jumps_that_do_not_make_the_run_clearly_more_probable_are_none(monkeypat
     assert found.values.atPose3(last).equals(right.values.atPose3(last), 1e-3)
 
 
+@pytest.mark.parametrize(("each", "taken"), [(20.0, 0), (30.0, 2)])
+def test_a_jump_has_to_be_worth_the_place_and_the_size_that_are_chosen_for_it(
+    monkeypatch: pytest.MonkeyPatch, each: float, taken: int
+) -> None:
+    """Fixes that wandered between high houses had 19 of 15 nats each: 17 m off, and 2.8 m without them."""
+    problem = lone_problem()
+    jumped = with_jumps_off_track(problem, off_at(problem, 4.1, 8.1))
+    monkeypatch.setattr(_batch, "with_jumps_off_track", lambda given, *_: jumped if given is problem else None)
+    monkeypatch.setattr(_batch, "cost_of_run", lambda given, *_: 500.0 - each * jumps_in(given))
+    assert jumps_in(_batch.solve_batch(problem).stated) == taken
+
+
 def test_jumps_found_with_noise_that_needs_another_start_are_stated(monkeypatch: pytest.MonkeyPatch) -> None:
     """The slow error was a state, and counted once more as left out; nothing was said of the jumps."""
     problem = lone_problem()
@@ -630,7 +642,7 @@ def test_jumps_found_with_noise_that_needs_another_start_are_stated(monkeypatch:
     monkeypatch.setattr(_batch, "with_jumps_off_track", lambda *_: seen.pop(0))
     monkeypatch.setattr(_batch, "with_needed_noise", lambda *_: noisier.pop(0))
     monkeypatch.setattr(_batch, "first_solution", by_motion)
-    monkeypatch.setattr(_batch, "CLEARLY", -np.inf)  # these fixes do not jump
+    monkeypatch.setattr(_batch, "_OF_A_JUMP", -np.inf)  # these fixes do not jump
     found = _batch.solve_batch(problem)
     assert seen == noisier == []
     for of in (found.problem, found.stated):
