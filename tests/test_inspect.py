@@ -528,6 +528,20 @@ def test_odometry_of_an_ins_is_no_wheels(topic: str, knows_east: bool, tmp_path:
     assert config.check_speed_topic == topic
 
 
+@pytest.mark.parametrize(("noise", "used"), [(1.1, "/imu"), (2.0, "/camera/imu")])
+def test_of_imus_about_as_noisy_one_whose_mount_is_known_is_used(noise: float, used: str, tmp_path: Path) -> None:
+    """A camera's, of which no tf tells where it sits, was taken where its gyroscope was less noisy by a hundredth."""
+    make, rng = Messages(2), np.random.default_rng(5)
+    items = [("/tf_static", START_NS, make.transforms([("base_link", "imu_link", (0, 0, 1), (0, 0, 0, 1))]))]
+    for k in range(2000):
+        stamp, gyro = START_NS + k * S // 50, 1e-3 * rng.normal(size=(2, 3)) * [[noise], [1.0]]
+        items.append(("/imu", stamp, make.imu(stamp, (0.0, 0.0, G), gyro[0].tolist(), frame="imu_link")))
+        items.append(("/camera/imu", stamp, make.imu(stamp, (0.0, -G, 0.0), gyro[1].tolist(), frame="camera_imu")))
+    _, config, _ = look(tmp_path, items, make)
+    assert config.sensors["imu"].topic == used
+    assert not config.sensors["imu_2"].enabled
+
+
 @pytest.mark.parametrize("body", ["vessel", "hull"])
 def test_body_frame_by_its_name_or_as_the_root(body: str, tmp_path: Path) -> None:
     make = Messages(2)
