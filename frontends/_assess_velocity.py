@@ -242,8 +242,9 @@ def _fused(topic: str, world: World) -> str:
         return "a filter's output by its name"
     if _INS.search(topic):
         return "an INS's output by its name"
-    if world.grid or world.centred or world.origin is not None:
+    if world.grid or world.centred or world.ned or world.origin is not None:
         frame = "a map grid" if world.grid else "earth-centred" if world.centred else "east-north-up about the fixes"
+        frame = "north, east, down" if world.ned else frame
         return f"an INS's or a filter's output, as its frame is {frame}, which no wheels know"
     return ""
 

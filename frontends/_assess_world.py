@@ -27,7 +27,7 @@ class World(NamedTuple):
     """Frame of poses: its origin, None if it is not east-north-up or unknown; the evidence in words.
 
     `pose`: whether they may be poses of the vessel about a datum, neither in a map grid nor of something else. `grid`: whether they are as
-    large as in a map grid. `centred`: whether they are as large as from the earth's centre.
+    large as in a map grid. `centred`: whether they are as large as from the earth's centre. `ned`: whether they look like north, east, down.
     """
 
     origin: Vec | None
@@ -35,6 +35,7 @@ class World(NamedTuple):
     pose: bool = True
     grid: bool = False
     centred: bool = False
+    ned: bool = False
 
 
 def in_map_grid(poses: TopicData) -> bool:
@@ -96,7 +97,7 @@ def world_of(
         as_ned = float(np.median(np.abs(b - 1j * a.conj())))  # east of it is its y
         if as_ned < min(largest, 0.5 * as_turned):
             why = f"its frame looks like north, east, down ({as_ned:.1f} m apart from the fixes): convert it to east, north, up"
-            return World(None, f"{why}; as it is it cannot be used")
+            return World(None, f"{why}; as it is it cannot be used", ned=True)
         return World(
             None, f"its frame is not east-north-up: turned by {turned:+.1f} deg, {apart:.1f} m apart from the fixes"
         )

@@ -254,7 +254,11 @@ def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
     lines = [f"{name}:", "  kind: imu", f"  topic: {imu.topic}"]
     reason = "; ".join(imu.why)
     if not enabled:
-        why = reason if imu.missing else "one IMU is used: a whole one, with gravity in it, and with least gyro noise"
+        why = (
+            reason
+            if imu.missing
+            else "one IMU is used: a whole one, with gravity in it, and with least gyro noise, of about equal ones that whose mount tf or the motion tells"
+        )
         lines.append(f"  enabled: false  # guess: {why}")
     if imu.accel_unit != "m/s^2":
         lines.append(f"  accel_unit: {imu.accel_unit}  # guess: {reason}")

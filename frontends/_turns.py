@@ -33,6 +33,7 @@ WANDERS_DEG = 1.0
 """Of a compass beside the gyroscope: above it there is more than such a comparison errs by."""
 _CELL_S, _WANDER_BLOCK_S, _LONG_BLOCK_S, _LAGS_S, _MINUTE_S = 2.0, 300.0, 60.0, (4.0, 24.0), 60.0
 """Headings are averaged over the first; of blocks as long as the second, changes over the third are compared."""
+_SCALE = 1.6  # of the ranges of a gyroscope each is twice the next; a compass in iron turns by a third too much
 Yaws = tuple[NDArray[np.int64], Array]  # stamps (N,), ns, and yaw (N,), rad
 _PART_DEG, _PART = 3.0, 3.0  # least RMS that is said; times the sigma that is claimed
 _LONG_S = 12.0  # over which courses are no noise (as in `_assess_imu.py`)
@@ -124,6 +125,18 @@ def refuse_unit(imu: ImuSeries, config: ImuConfig, yaws_by_source: Mapping[str, 
                 f"{imu.sensor}: its gyro turns {max(times, 1.0 / times):.0f} times {wrong} than {source}, in step with them: "
                 f"angular_velocity of {config.topic} is in {right}; set gyro_unit: {right} of sensors.{imu.sensor}"
             )
+
+
+def scale_warning(imu: ImuSeries, sensor: str, yaws: Yaws) -> list[str]:
+    """Return a line if yaws turn in step with the gyroscope, but clearly more or less: a driver that has its range, or a unit of its own."""
+    times = _times_turned(imu, yaws)
+    if times == 0.0 or 1.0 / _SCALE < times < _SCALE:
+        return []
+    more = f"{times:.1f} times less" if times > 1.0 else f"{1.0 / times:.1f} times more"
+    said = f"{imu.sensor}: its gyro turns {more} than the headings of {sensor}, in step with them: its rates are neither in rad/s nor in deg/s"
+    return [
+        f"{said} (a driver that takes another range for the gyroscope's), which no key corrects; or these headings are in another unit"
+    ]
 
 
 def _times_turned(imu: ImuSeries, yaws: Yaws) -> float:

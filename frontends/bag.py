@@ -49,7 +49,7 @@ from graphloc.frontends._references import Reference, check_speed, true_trajecto
 from graphloc.frontends._sanity import lever_warning
 from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._turns import Yaws, pose_turn_warning, refuse_unit, turn_warnings, wander_warning
+from graphloc.frontends._turns import Yaws, pose_turn_warning, refuse_unit, scale_warning, turn_warnings, wander_warning
 from graphloc.frontends.decode import (
     NMEA,
     ODOMETRY,
@@ -334,11 +334,13 @@ def _yaw_of(value: Decoded) -> float:
 def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
     lines = []
     for readings in sensors:
+        if yaws := _yaws_of(readings):
+            lines += scale_warning(imu, readings.sensor, yaws)
         if isinstance(readings.config, CompassConfig):
             headings = readings.of(CompassHeading)
             lines += turn_warnings(imu, readings.sensor, headings, readings.config.convention)
             lines += wander_warning(imu, readings.sensor, headings, readings.config)
-        elif yaws := _yaws_of(readings):
+        elif yaws:
             lines += pose_turn_warning(imu, readings.sensor, yaws)
     return lines
 

@@ -116,6 +116,7 @@ _MOST_TRIED = 200  # messages of a topic that cannot be decoded
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
 # Clouds that were made of another one; those of depth cameras and radars.
 _DERIVED = re.compile(r"filter|crop|voxel|sampl|ground|cluster|segment|obstacle|register|skew|second", re.IGNORECASE)
+_AS_NOISY = 1.5  # gyro noise, times that of the least noisy IMU, up to which one is as good
 _NO_LIDAR = re.compile(r"depth|radar|stereo", re.IGNORECASE)
 _LOOKS_AHEAD_DEG = np.array([-90.0, 0.0, -90.0])  # of an optical frame
 _DOWN = np.diag([1.0, -1.0, -1.0])  # to axes ahead, to port, up from such ahead, to starboard, down
@@ -212,7 +213,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     known = len(reference.stamps_ns) > 0
     courses = courses_of(reference.stamps_ns, reference.p_m, reference.scatter_m) if known else None
     imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, motions, courses, tree, body))]
-    imus.sort(key=lambda i: (bool(i.missing), i.gravity == "removed", i.gyro_noise_mdps))
+    imus = _best_first(imus)
     down = _looks_down(bag, imus, gnss)
     imus = [_in_turned_body(imu) for imu in imus] if down else imus
     felt = felt_of(bag.aligned[imus[0].topic], imus[0], tree, body) if imus else None
@@ -460,6 +461,21 @@ def _as_mostly_set(stream: TopicData, steps: Mapping[str, ClockStep]) -> TopicDa
     after = stream.logs_ns >= at.at_ns
     by_ns = round(at.by_s * NS_PER_S)
     return stream.stamped(stream.stamps_ns + np.where(after, 0, by_ns) - (0 if 2 * after.sum() > len(after) else by_ns))
+
+
+def _best_first(imus: Sequence[ImuReport]) -> list[ImuReport]:
+    """Return whole IMUs with gravity in them first, the least noisy ones first; of those about as noisy, one whose mount tf or the motion tells."""
+
+    def kind(imu: ImuReport) -> tuple[bool, bool]:
+        return bool(imu.missing), imu.gravity == "removed"
+
+    def key(imu: ImuReport) -> tuple[object, ...]:
+        least = min(other.gyro_noise_mdps for other in imus if kind(other) == kind(imu))
+        noisy = imu.gyro_noise_mdps > _AS_NOISY * least
+        unplaced = imu.mount.tf_frame is None and imu.mount.xyz_m is None
+        return kind(imu), noisy, unplaced, not imu.mount.yaw_told, imu.gyro_noise_mdps
+
+    return sorted(imus, key=key)
 
 
 def _lacking(

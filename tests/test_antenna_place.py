@@ -24,7 +24,8 @@ from graphloc.graph import PLACE, Attachment, Decision, Sensor, antenna_off_m, c
 from graphloc.linear import factors_of
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.online._lag import Lag
-from graphloc.online._live import ReceiverDetectors
+from graphloc.online._live import LiveStream, ReceiverDetectors
+from graphloc.online._receiver_checks import _antenna
 from graphloc.replay import replay
 from tests.faults import Fed, arrivals_of, feed
 from tests.slowly import with_few_states
@@ -97,6 +98,18 @@ def test_an_antenna_is_where_a_mount_there_has_it() -> None:
         late = np.array([0.07, 0.0, 0.0, 0.0]) if row is gnss.ROW else np.zeros(3)
         m = row.ideal(displacing(at, value), config)
         np.testing.assert_allclose(row.residuals(m, config, displacing(there, late))[0].raw, 0.0, atol=1e-6)
+
+
+def test_online_a_receiver_is_judged_at_the_antenna_as_estimated() -> None:
+    """At the configured place a vessel that turned about a boom's antenna looked like one whose receiver is frozen."""
+    at = displacing(attachment(gnss.ROW, GNSS, slow=False), np.array([0.07, *OFF_M]))
+    (constant,) = gnss.ROW.constants(GNSS)
+    place_m, v_mps = _antenna(cast("LiveStream", SimpleNamespace(constants=(constant,))), at)
+    said = gnss.ROW.hint(gnss.ROW.ideal(at, GNSS), 0.0, at.datum)
+    np.testing.assert_allclose(place_m, said.p_world_m[:2], atol=1e-6)
+    there = replace(at, lever_m=at.lever_m + at.T_state_sensor.rotation().matrix() @ OFF_M)
+    np.testing.assert_allclose(v_mps, there.sensor_velocity_mps(), atol=1e-9)
+    assert np.linalg.norm(v_mps - at.sensor_velocity_mps()) > 0.05
 
 
 def yaw_errors_deg(run: SimulatedRun, fed: Fed) -> Array:

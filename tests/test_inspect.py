@@ -528,6 +528,20 @@ def test_odometry_of_an_ins_is_no_wheels(topic: str, knows_east: bool, tmp_path:
     assert config.check_speed_topic == topic
 
 
+@pytest.mark.parametrize(("noise", "used"), [(1.1, "/imu"), (2.0, "/camera/imu")])
+def test_of_imus_about_as_noisy_one_whose_mount_is_known_is_used(noise: float, used: str, tmp_path: Path) -> None:
+    """A camera's, of which no tf tells where it sits, was taken where its gyroscope was less noisy by a hundredth."""
+    make, rng = Messages(2), np.random.default_rng(5)
+    items = [("/tf_static", START_NS, make.transforms([("base_link", "imu_link", (0, 0, 1), (0, 0, 0, 1))]))]
+    for k in range(2000):
+        stamp, gyro = START_NS + k * S // 50, 1e-3 * rng.normal(size=(2, 3)) * [[noise], [1.0]]
+        items.append(("/imu", stamp, make.imu(stamp, (0.0, 0.0, G), gyro[0].tolist(), frame="imu_link")))
+        items.append(("/camera/imu", stamp, make.imu(stamp, (0.0, -G, 0.0), gyro[1].tolist(), frame="camera_imu")))
+    _, config, _ = look(tmp_path, items, make)
+    assert config.sensors["imu"].topic == used
+    assert not config.sensors["imu_2"].enabled
+
+
 @pytest.mark.parametrize("body", ["vessel", "hull"])
 def test_body_frame_by_its_name_or_as_the_root(body: str, tmp_path: Path) -> None:
     make = Messages(2)
@@ -864,9 +878,9 @@ def test_a_receiver_without_a_message_and_damaged_transforms_are_reported(tmp_pa
     assert any(w == "/fix: not a message on it" for w in found.warnings)
 
 
-@pytest.mark.parametrize("frame", ["map grid", "earth-centred"])
+@pytest.mark.parametrize("frame", ["map grid", "earth-centred", "north, east, down"])
 def test_an_ins_that_tells_its_speed_is_no_wheels(frame: str, tmp_path: Path) -> None:
-    """In UTM without a fix it is the receiver, and then checks no speed, which `smooth` refused; from the earth's centre it is none."""
+    """In UTM without a fix it is the receiver, and then checks no speed, which `smooth` refused; otherwise it is none."""
     make = Messages(2)
     driven = drive(make)
     items = [item for item in driven if item[0] in ("/imu", "/compass") or (item[0] == "/fix" and frame != "map grid")]
@@ -875,10 +889,13 @@ def test_an_ins_that_tells_its_speed_is_no_wheels(frame: str, tmp_path: Path) ->
     for _, log_ns, fix in [item for item in driven if item[0] == "/fix"]:
         lla = np.array([fix.latitude]), np.array([fix.longitude]), np.array([fix.altitude])
         enu = DATUM.enu_from_geodetic(*lla)[0]
-        off_m = (EASTING, NORTHING, 0.0) if frame == "map grid" else (3.3e6, 0.7e6, 5.4e6)
+        off_m = {"map grid": (EASTING, NORTHING, 0.0), "earth-centred": (3.3e6, 0.7e6, 5.4e6)}.get(
+            frame, (0.0, 0.0, 0.0)
+        )
+        place_m = enu[[1, 0, 2]] * (1.0, 1.0, -1.0) if frame == "north, east, down" else enu + off_m
         stamp = fix.header.stamp.sec * S + fix.header.stamp.nanosec
         v = (float(np.interp(stamp, at_ns, speeds)), 0.0, 0.0)
-        items.append(("/applanix/pose", log_ns, make.odometry(stamp, (enu + off_m).tolist(), v=v)))
+        items.append(("/applanix/pose", log_ns, make.odometry(stamp, place_m.tolist(), v=v)))
     found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
     (item,) = found.odometry
     assert item.fused

@@ -18,6 +18,7 @@ from graphloc.frontends._turns import (
     Yaws,
     pose_turn_warning,
     refuse_unit,
+    scale_warning,
     scattered,
     turn_warnings,
     wander_deg,
@@ -239,6 +240,15 @@ def test_rates_in_another_unit_are_refused(
             replace(imu, gyro_radps=times * imu.gyro_radps), imu_config(configured), {source: (stamps, sense * yaw)}
         )
     refuse_unit(imu, imu_config(configured), {source: (stamps, sense * yaw)})
+
+
+@pytest.mark.parametrize("times", [0.25, 0.5, 1.0, 1.25, 2.0, 16.0])
+def test_rates_in_no_unit_are_said(times: float, run: SimulatedRun) -> None:
+    """A gyroscope whose driver takes another range for its own; one that is off by a quarter may be the compass's iron."""
+    imu, _ = of(run)
+    lines = scale_warning(replace(imu, gyro_radps=times * imu.gyro_radps), "compass", told_by(run, "compass"))
+    said = f"{max(times, 1.0 / times):.1f} times {'more' if times > 1.0 else 'less'} than the headings of compass"
+    assert [said in line for line in lines] == ([True] if times not in (1.0, 1.25) else [])
 
 
 @pytest.mark.parametrize("seed", range(20))

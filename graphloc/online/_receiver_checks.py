@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 
 from graphloc import gauss
 from graphloc.frames import Array
 from graphloc.frozen_receiver import FROZEN, WHY_VELOCITY
-from graphloc.graph import Attachment, Residual
+from graphloc.graph import TIME_OFFSET, Attachment, Residual, antenna_off_m, corrections
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
 from graphloc.online._entries import Entries
@@ -53,19 +54,19 @@ class ReceiverChecks:
         told_m = hint.p_world_m[:2]
         if not stream.row.absolute or not np.isfinite(told_m).all():
             return ""
-        if self._repeats(stream, m, at, told_m):
+        estimated_m, v_mps = _antenna(stream, at)
+        if self._repeats(stream, m, at, told_m, v_mps):
             return _FROZEN if stream.receiver.repeated_fix.frozen else _OLD
         sigma_m = largest_sigma(residual.white_cov)
-        estimated_m = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation()))[:2]
         if self._is_frozen(stream, m, told_m, estimated_m, sigma_m):
             return _FROZEN
         self._check_jump(stream, m.stamp_ns, told_m, sigma_m, self._off(stream, at, residual, told_m - estimated_m))
         return _OFF if stream.receiver.jump.suspects(m.stamp_ns) else ""
 
-    def _repeats(self, stream: LiveStream, m: Measurement, at: Attachment, told_m: Array) -> bool:
+    def _repeats(self, stream: LiveStream, m: Measurement, at: Attachment, told_m: Array, antenna_mps: Array) -> bool:
         newest, detector = self._states.newest, stream.receiver.repeated_fix
         # The antenna swings in waves, and the vessel may turn about it.
-        slower_mps = min(newest.velocity, at.sensor_velocity_mps(), key=lambda v: float(np.linalg.norm(v[:2])))
+        slower_mps = min(newest.velocity, antenna_mps, key=lambda v: float(np.linalg.norm(v[:2])))
         v_mps = np.asarray(at.T_world_body.rotation().matrix().T @ slower_mps)[:2]
         since_ns = detector.note(m.stamp_ns, told_m, v_mps, largest_sigma(newest.velocity_cov))
         if since_ns is not None:
@@ -131,3 +132,18 @@ class ReceiverChecks:
         """Return a line on each receiver whose position has jumped, or turned out to have been frozen, since this was last asked."""
         warnings, self._warnings = self._warnings, []
         return warnings
+
+
+def _antenna(stream: LiveStream, at: Attachment) -> tuple[Array, Array]:
+    """Return where the estimate has the antenna when a fix was measured (2,), m, and its velocity (3,), m/s, in world.
+
+    With what is estimated of its place and of the fix's delay: else a vessel that turns about an antenna far from where it is configured
+    looks like one with a frozen receiver.
+    """
+    values = (value for _, value in at.constants)
+    found = corrections(zip(stream.constants, values, strict=False), gtsam.Pose3())  # in the antenna's own axes
+    off_m = antenna_off_m(found)
+    off_m = np.zeros(3) if off_m is None else off_m
+    v_mps = at.sensor_velocity_mps(off_m)
+    place = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.transformFrom(off_m)))
+    return place[:2] + v_mps[:2] * found.get(TIME_OFFSET, 0.0), v_mps
