@@ -34,7 +34,7 @@ from tests.slowly import with_few_states
 from tests.test_online_faults import smoother
 
 RTK_S, OTHER_S, SIGMA_M = 14.0, 16.0, {True: 0.02, False: 1.0}
-TRACK = Scenario(path="loops", duration_s=105.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, pose_hz=0.0)
+TRACK = Scenario(path="loops", duration_s=105.0, imu_hz=25.0, gnss_hz=2.0, compass_hz=1.0, pose_hz=0.0)
 
 
 METRES = SlowErrorConfig(horizontal_sigma_m=2.0, vertical_sigma_m=4.0, time_constant_s=60.0)
