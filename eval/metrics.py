@@ -104,23 +104,32 @@ class TrackErrors(PositionErrors):
     estimate: Trajectory
 
 
+def common_stamps(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.int64], float]:
+    """Return the stamps (N,) of the truth that an estimate covers, and which share of all they are.
+
+    Raises:
+        NoCommonTimeError: it covers none of them.
+    """
+    covered = estimate.covers(truth.stamps_ns)
+    if not covered.any():
+        raise NoCommonTimeError("the track and the truth share no time: check the stamps of truth_topic")
+    return truth.stamps_ns[covered], float(covered.mean())
+
+
 def errors(estimate: Trajectory, truth: Trajectory) -> TrackErrors:
     """Return the errors of an estimate at the stamps of the truth that it covers.
 
     Raises:
         NoCommonTimeError: it covers none of them.
     """
-    covered = estimate.covers(truth.stamps_ns)
-    stamps = truth.stamps_ns[covered]
-    if not len(stamps):
-        raise NoCommonTimeError("the track and the truth share no time: check the stamps of truth_topic")
+    stamps, covered = common_stamps(estimate, truth)
     there, true = estimate.at(stamps), truth.at(stamps)
     return TrackErrors(
         stamps_ns=stamps,
         position_m=there.p_world_m - true.p_world_m,
         heading_rad=wrap_angle(there.yaw_rad - true.yaw_rad),
         estimate=there,
-        covered=float(covered.mean()),
+        covered=covered,
     )
 
 

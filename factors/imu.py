@@ -90,7 +90,6 @@ class Links:
     def forget(self, before_ns: int) -> None:
         """Drop the samples before a stamp except the last of them, and those that tell how a gap goes on."""
         self._left_out = [gap for gap in self._left_out if gap[1] >= before_ns]
-        self._pauses = [pause for pause in self._pauses if pause[1] >= before_ns]
         before_ns = min([before_ns, *(a - int(_AROUND_S * 1e9) for a, _ in self._left_out)])
         first = max(int(np.searchsorted(self._stamps, before_ns)) - 1, 0)
         self._stamps, self._samples = self._stamps[first:].copy(), self._samples[first:].copy()

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -129,18 +128,21 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
             continue
         middle = middle[good]
         along = (moved * np.conj(chord / np.maximum(np.abs(chord), MOVES_M)))[good].real
-        parts = [_felt_along(felt, at, motion.speed_mps, middle, half_s, lag) for lag in lags]
-        whole = _best_lag(along, parts, lags, windows)
+        block = (middle - middle[0]) // _BLOCK_S
+        begun = np.flatnonzero(np.diff(block, prepend=-1.0))
+        felt_at = (_felt_along(felt, at, motion.speed_mps, middle, half_s, lag) for lag in lags)
+        sums = np.stack([_sums(along, own, swung, begun) for own, swung in felt_at])
+        total = sums.sum(axis=1)
+        whole = _best_lag(total, lags, windows)
         if whole is None:
             continue
         better, value, sigma = whole
         # A jump of the fixes is an acceleration that some lag fits by chance; how much that tells differs from block to block.
-        block = (middle - middle[0]) // _BLOCK_S
-        rest = [block != k for k in np.unique(block)]
-        if len(rest) > 2:
-            without = [_best_lag(along[r], [(a[r], b[r]) for a, b in parts], lags, windows * r.mean()) for r in rest]
+        if len(begun) > 2:
+            rest = (total - sums[:, k] for k in range(len(begun)))
+            without = [_best_lag(r, lags, windows * float(r[0, 0, 0]) / len(along)) for r in rest]
             values = np.array([np.inf if one is None else one[1] for one in without])
-            scatter = np.sqrt((len(rest) - 1) * np.var(values)) if np.isfinite(values).all() else np.inf
+            scatter = np.sqrt((len(begun) - 1) * np.var(values)) if np.isfinite(values).all() else np.inf
             sigma = max(sigma, float(scatter))
         found.append((better, value, sigma))
     if not found:
@@ -149,17 +151,17 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
     return MotionOffset(value, sigma, better > _CLEAR**2 and abs(value) > max(_CLEAR * sigma, _LEAST_OF_WAY_S))
 
 
-def _best_lag(
-    along: Array, parts: Sequence[tuple[Array, Array]], lags: Array, windows: float
-) -> tuple[float, float, float] | None:
+def _best_lag(sums: Array, lags: Array, windows: float) -> tuple[float, float, float] | None:
     """Return by how much chi-square is better with the best offset than with none, that offset, and its sigma, s; None where there is none.
 
     Args:
-        along: (N,) accelerations. parts: for each of the lags, what is felt and the swing (N,). windows: how many of the N are not alike.
+        sums: (L, 4, 4) of `_sums`, for each of the lags. windows: how many of what they are sums of are not alike.
     """
-    alone = max(_explained(along, own, swung, np.inf) for own, swung in parts)
-    held = (1.0 - alone**2) * float(along.var()) * len(along) / windows / _HIGH_M**2
-    c = np.array([_explained(along, *part, held) for part in parts])
+    count, mean = sums[0, 0, 0], sums[:, 0, 1:] / sums[0, 0, 0]
+    spread = sums[:, 1:, 1:] - count * mean[:, :, None] * mean[:, None]
+    alone = float(_explained(spread[:, :2, :2], 0.0).max())
+    held = (1.0 - alone**2) * float(spread[0, 0, 0]) / windows / _HIGH_M**2
+    c = _explained(spread, held)
     k = int(c.argmax())
     bend = 0.0 if k in (0, len(c) - 1) else float(2.0 * c[k] - c[k - 1] - c[k + 1]) / _APART_S**2
     if bend <= 0.0 or c[k] <= 0.0:
@@ -211,14 +213,22 @@ def _felt_along(
     return (moved * ahead).real, (swung * ahead).real
 
 
-def _explained(along: Array, felt: Array, swung: Array, held: float) -> float:
-    """Return the correlation of an acceleration with what is felt and some of a swing; 0 where it is the opposite of what is felt.
+def _sums(along: Array, felt: Array, swung: Array, begun: NDArray[np.int64]) -> Array:
+    """Return the sums (B, 4, 4), over blocks that begin there, of products of 1, an acceleration, what is felt and a swing (N,)."""
+    parts = np.stack([np.ones(len(along)), *(part - part.mean() for part in (along, felt, swung))])
+    return np.add.reduceat(parts[:, None] * parts, begun, axis=2).transpose(2, 0, 1)
+
+
+def _explained(spread: Array, held: float) -> Array:
+    """Return the correlation (L,) of an acceleration with what is felt and some of a swing; 0 where it is the opposite of what is felt.
 
     Args:
+        spread: (L, 3, 3) sums of products of the three about their means; (L, 2, 2): without the swing.
         held: what the square of that share costs, beside squares of the acceleration.
     """
-    y, X = along - along.mean(), np.column_stack([felt - felt.mean(), swung - swung.mean()])
-    X = X[:, :1] if np.isinf(held) else X
-    share = np.linalg.lstsq(X.T @ X + np.diag([0.0, held])[: X.shape[1], : X.shape[1]], X.T @ y, rcond=None)[0]
-    power = float(y @ y)
-    return float(np.sqrt(max(share @ X.T @ y, 0.0) / power)) if power > 0.0 and share[0] > 0.0 else 0.0
+    power, by = float(spread[0, 0, 0]), spread[:, 0, 1:]
+    among = spread[:, 1:, 1:] + np.diag([0.0, held])[: by.shape[1], : by.shape[1]]
+    share = np.einsum("lij,lj->li", np.linalg.pinv(among, hermitian=True), by)
+    if power <= 0.0:
+        return np.zeros(len(spread))
+    return np.where(share[:, 0] > 0.0, np.sqrt(np.maximum((share * by).sum(axis=1), 0.0) / power), 0.0)

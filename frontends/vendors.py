@@ -449,11 +449,11 @@ def _ins_velocity(msg: Any) -> SaidVelocity | Rejection:
         return trouble
     north, east, up = (_known(_oem7_sigma(msg, f"{way}_velocity")) for way in ("north", "east", "up"))
     # INSPVA of `novatel_msgs` numbers them, in the order of the receiver's log.
-    v = (
+    v_east, v_north, v_up = (
         float(_any(msg, *names))
         for names in (("east_velocity", "vely"), ("north_velocity", "velx"), ("up_velocity", "velz"))
     )
-    return SaidVelocity((next(v), next(v), next(v)), max(north, east), up, filtered=True)
+    return SaidVelocity((v_east, v_north, v_up), max(north, east), up, filtered=True)
 
 
 def _ins_heading(msg: Any) -> SaidHeading | Rejection:

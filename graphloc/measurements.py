@@ -32,6 +32,8 @@ def _frozen(value: object, shape: tuple[int, ...], name: str) -> Array:
 
 def _frozen_covariance(value: object, size: int, name: str) -> Array:
     cov = _frozen(value, (size, size), name)
+    if np.count_nonzero(cov) == size and all(variance > 0.0 for variance in cov.diagonal().tolist()):
+        return cov  # diagonal, as mostly
     # `np.allclose` written out: that takes longer than all else that is done here.
     if (np.abs(cov - cov.T) > 1e-12 + 1e-6 * np.abs(cov.T)).any() or np.linalg.eigvalsh(cov).min() <= 0.0:
         raise ValueError(f"{name} is not symmetric positive definite")

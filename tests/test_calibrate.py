@@ -250,7 +250,7 @@ def test_imu_noise_that_is_configured_too_large_is_seen(times: float, needed: fl
 
 
 def test_nothing_is_looked_at_unasked(right: app.Run) -> None:
-    short = simulate(Scenario(duration_s=12.0), 1)
+    short = simulate(Scenario(duration_s=12.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 1)
     datum = app.choose_datum(short.recording, short.config)
     recording = app.with_synthetic(short.recording, short.config, datum)
     plain = smooth(recording, short.config, datum, rows=SENSORS, inertial=INERTIAL)
@@ -266,7 +266,7 @@ def test_a_solution_stands_where_nothing_can_be_said_of_it(monkeypatch: pytest.M
         raise RuntimeError("Factor is exactly singular")
 
     monkeypatch.setattr("graphloc.solve.offsets_of", fail)
-    run = app.simulated(simulate(Scenario(duration_s=12.0), 1))
+    run = app.simulated(simulate(Scenario(duration_s=12.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 1))
     assert any(
         "calibration could not be examined: Factor is exactly singular" in w for w in run.solution.stats.warnings
     )

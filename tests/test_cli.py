@@ -27,7 +27,11 @@ from tests.slowly import simulate_slowly
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    return write_bag(simulate_slowly(Scenario(duration_s=15.0), 3), tmp_path_factory.mktemp("cli") / "bag", ros=2)
+    return write_bag(
+        simulate_slowly(Scenario(duration_s=15.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3),
+        tmp_path_factory.mktemp("cli") / "bag",
+        ros=2,
+    )
 
 
 def edited(config: Path, folder: Path, old: str, new: str) -> Path:

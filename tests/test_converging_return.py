@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from graphloc.eval.metrics import errors
-from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition
 from graphloc.solution import Solution
 from graphloc.solve import smooth
+from tests.slowly import simulate_slowly
 
 _OUTAGE_S, _TAU_S = (30.0, 70.0), 8.0
 
@@ -26,7 +27,7 @@ def run() -> SimulatedRun:
         path="loops", noise="clean", duration_s=130.0, outage_s=_OUTAGE_S, pose_hz=0.0, gnss_hz=1.0, compass_hz=1.0,
         gnss_sigma_m=1.0,
     )  # fmt: skip
-    return simulate(scenario, 1)
+    return simulate_slowly(scenario, 1)
 
 
 def _error_m(run: SimulatedRun, m: GnssPosition, off_m: float) -> float:

@@ -123,7 +123,9 @@ def test_a_bag_whose_imu_is_frozen_throughout_is_refused_with_the_cause(tmp_path
 
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
-    return simulate_slowly(Scenario(path="loops", duration_s=40.0, noise="clean", false_fraction=0.0), 12)
+    return simulate_slowly(
+        Scenario(path="loops", duration_s=40.0, noise="clean", false_fraction=0.0, gnss_hz=2.0, compass_hz=2.0), 12
+    )
 
 
 def struck(run: SimulatedRun, begin_s: float, end_s: float) -> Arrivals:

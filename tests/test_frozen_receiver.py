@@ -195,7 +195,9 @@ def test_what_comes_after_a_silence_tells_little_of_a_rest(
 
 def test_a_frozen_receiver_is_as_good_as_a_silent_one() -> None:
     """Followed, the track is 26 to 36 m off there; nothing but IMU and compass is beside it."""
-    run = simulate_slowly(Scenario(path="loops", duration_s=60.0, noise="drift"), 1)
+    run = simulate_slowly(
+        Scenario(path="loops", duration_s=60.0, noise="drift", imu_hz=50.0, gnss_hz=5.0, compass_hz=2.0), 1
+    )
     fixes = run.recording.of(GnssPosition)
     begin_ns, end_ns = fixes[0].stamp_ns + 25 * S, fixes[0].stamp_ns + 40 * S
     held = next(m for m in fixes if m.stamp_ns >= begin_ns)

@@ -52,7 +52,7 @@ def wander(t_s: Array, rng: np.random.Generator, sigma_m: float = SIGMA_M, time_
 def with_usbl(seed: int, **slow_error: float) -> SimulatedRun:
     """A run without GNSS; a log over ground, a compass, and a place of 0.5 m every 2 s with an error that lasts."""
     scenario = Scenario(
-        path="loops", duration_s=300.0, imu_hz=50.0, gnss_hz=0.0, compass_hz=1.0, log_hz=1.0, log_through="ground",
+        path="loops", duration_s=300.0, imu_hz=25.0, gnss_hz=0.0, compass_hz=1.0, log_hz=1.0, log_through="ground",
         pose_hz=0.5, pose_sigma_m=0.5, false_fraction=0.0,
     )  # fmt: skip
     run = simulate_slowly(scenario, seed, 1.0)

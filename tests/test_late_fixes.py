@@ -22,7 +22,14 @@ from tests.test_factors import attachment, values_of
 
 LATE_S = 0.1
 SCENARIO = Scenario(
-    path="loops", duration_s=40.0, noise="clean", pose_hz=0.0, gnss_hz=2.5, gnss_sigma_m=0.02, imu_hz=50.0
+    path="loops",
+    duration_s=40.0,
+    noise="clean",
+    pose_hz=0.0,
+    gnss_hz=2.5,
+    gnss_sigma_m=0.02,
+    imu_hz=50.0,
+    compass_hz=2.5,
 )
 
 

@@ -29,7 +29,7 @@ from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory, bounds_95
 from tests.slowly import simulate_slowly
 
-BASE = Scenario(path="loops", duration_s=40.0, noise="clean", pose_hz=0.0, imu_hz=50.0)
+BASE = Scenario(path="loops", duration_s=40.0, noise="clean", pose_hz=0.0, imu_hz=50.0, compass_hz=2.0)
 
 
 def only(recording: Recording, keep: tuple[Measurement, ...]) -> Recording:
@@ -403,7 +403,7 @@ def test_the_deviation_of_a_compass_is_told_by_the_motion() -> None:
 
 def test_a_compass_that_wanders_is_held_by_the_map_and_in_its_bounds() -> None:
     """Off by up to 3 deg, three of its sigmas, now to one side, now to the other, in 40 s. Taken for noise it bends the heading."""
-    run = simulate(replace(BASE, duration_s=40.0, pose_hz=1.0, imu_hz=100.0, false_fraction=0.2), 3)
+    run = simulate(replace(BASE, duration_s=40.0, pose_hz=1.0, compass_hz=10.0, imu_hz=100.0, false_fraction=0.2), 3)
 
     def wandered(m: Measurement) -> Measurement:
         if not isinstance(m, CompassHeading):

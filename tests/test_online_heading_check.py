@@ -139,9 +139,10 @@ def said_of(
     if before_ns:
         at_once: Any = SimpleNamespace(stamp_ns=before_ns)
         check.look(SimpleNamespace(first_ns=before_ns - SECOND // 5, problem=problem, newest=at_once))  # type: ignore[arg-type]
-    for stamp_ns in range(begin_ns + SECOND // 5, begin_ns + 69 * SECOND, SECOND // 5):
-        at = run.truth.at(np.array([stamp_ns]))
-        pose = gtsam.Pose3(gtsam.Rot3.Yaw(turned_rad).compose(gtsam.Rot3(at.R_world_body[0])), at.p_world_m[0])
+    stamps_ns = range(begin_ns + SECOND // 5, begin_ns + 69 * SECOND, SECOND // 5)
+    at = run.truth.at(np.array(stamps_ns))
+    for stamp_ns, R, place_m in zip(stamps_ns, at.R_world_body, at.p_world_m, strict=True):
+        pose = gtsam.Pose3(gtsam.Rot3.Yaw(turned_rad).compose(gtsam.Rot3(R)), place_m)
         newest = SimpleNamespace(
             stamp_ns=stamp_ns, pose=pose, pose_cov=1e-4 * np.eye(6), bias=gtsam.imuBias.ConstantBias()
         )

@@ -32,7 +32,7 @@ NOWHERE = Antennas(configured={})
 @pytest.fixture(scope="module")
 def data() -> ReportData:
     """With an outage from 8 to 14 s."""
-    run = app.simulated(simulate(Scenario(duration_s=22.0, outage_s=(8.0, 14.0)), 3))
+    run = app.simulated(simulate(Scenario(duration_s=22.0, outage_s=(8.0, 14.0), imu_hz=50.0, compass_hz=2.0), 3))
     return app.report_data(replace(run, recording=replace(run.recording, warnings=())))
 
 

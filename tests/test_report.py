@@ -29,7 +29,7 @@ from tests.slowly import beside_filters, simulate_slowly
 
 @pytest.fixture(scope="module")
 def data() -> ReportData:
-    run = beside_filters(simulate_slowly(Scenario(duration_s=20.0), 3))
+    run = beside_filters(simulate_slowly(Scenario(duration_s=20.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3))
     return ReportData(
         title="a <run>",
         solution=run.solution,

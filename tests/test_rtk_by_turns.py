@@ -34,7 +34,7 @@ from tests.slowly import with_few_states
 from tests.test_online_faults import smoother
 
 RTK_S, OTHER_S, SIGMA_M = 14.0, 16.0, {True: 0.02, False: 1.0}
-TRACK = Scenario(path="loops", duration_s=105.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, pose_hz=0.0)
+TRACK = Scenario(path="loops", duration_s=105.0, imu_hz=25.0, gnss_hz=2.0, compass_hz=1.0, pose_hz=0.0)
 
 
 METRES = SlowErrorConfig(horizontal_sigma_m=2.0, vertical_sigma_m=4.0, time_constant_s=60.0)
@@ -322,10 +322,12 @@ def test_receivers_that_lose_rtk_together_may_be_lost_again_apart() -> None:
     """Both are silent from 10 s to 20 s, and the first one again, so that only its next level ends before the run does."""
     stamps = [[*range(11), *range(20, 31), *range(40, 51)], [*range(11), *range(20, 51)]]
     streams = [
-        SimpleNamespace(number=n, measurements=[SimpleNamespace(stamp_ns=t * S) for t in own], anew=np.array(anew))
+        SimpleNamespace(
+            number=n, measurements=[SimpleNamespace(stamp_ns=t * S) for t in own], state=own, anew=np.array(anew)
+        )
         for n, (own, anew) in enumerate(zip(stamps, ([10, 30], [10]), strict=True))
     ]
-    timeline = SimpleNamespace(slow_stamps_ns=np.arange(51) * S)
+    timeline = SimpleNamespace(slow_of=np.arange(51))
     case: Any = SimpleNamespace(
         streams=streams, problem=SimpleNamespace(timeline=timeline), levels=lambda _span: [np.ones(3)]
     )
@@ -335,3 +337,15 @@ def test_receivers_that_lose_rtk_together_may_be_lost_again_apart() -> None:
         (0, 30, None),
     ]
     assert [(span.gap_ns, span.until_ns) for span in spans if span.of == 1] == [((10 * S, 20 * S), None)]
+
+
+def test_rtk_that_is_back_for_one_fix_a_little_before_the_state_it_is_carried_to() -> None:
+    """Errors that change every 20 s: that state is the first after 20 s, the fix came 40 ms earlier, and no later one."""
+    stamps = [SimpleNamespace(stamp_ns=t * S // 100) for t in (0, 500, 1000, 1996)]
+    stream = SimpleNamespace(number=0, measurements=stamps, state=[0, 50, 100, 200], anew=np.array([0]))
+    timeline = SimpleNamespace(slow_of=np.repeat([0, 1], [200, 1]), slow_stamps_ns=np.array([0, 20 * S]))
+    case: Any = SimpleNamespace(
+        streams=[stream], problem=SimpleNamespace(timeline=timeline), levels=lambda _span: [np.ones(3)]
+    )
+    (span,) = _drawn_anew(case)
+    assert span.gap_ns == (10 * S, 1996 * S // 100)

@@ -29,7 +29,7 @@ PIECE, PIECES = 4096, 20_000  # bytes; small enough for the heap
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    run = simulate(Scenario(duration_s=12.0), 1)
+    run = simulate(Scenario(duration_s=12.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 1)
     datum = app.choose_datum(run.recording, run.config)
     recording = app.with_synthetic(run.recording, run.config, datum)
     return make_problem(recording, run.config, datum, SENSORS, INERTIAL)
@@ -113,7 +113,7 @@ def test_tree_and_graph_are_gone_before_memory_is_given_back_and_offsets_are_ask
     monkeypatch.setattr(graphloc.solve, "solve_batch", solved)
     monkeypatch.setattr(graphloc.solve, "give_back_memory", noted("given back", give_back_memory))
     monkeypatch.setattr(graphloc.solve, "offsets_of", noted("asked", offsets_of))
-    run = simulate(Scenario(duration_s=12.0), 1)
+    run = simulate(Scenario(duration_s=12.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 1)
     smooth(run.recording, run.config, problem.datum, rows=SENSORS, inertial=INERTIAL, probe=PROBE)
     assert len(held) == 2
     assert said == ["given back: 0 held", "asked: 0 held"]

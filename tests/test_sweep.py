@@ -199,7 +199,9 @@ def test_what_was_stopped_goes_on_and_ends_with_the_same_table(tmp_path: Path, m
 
 def test_a_bag_with_its_configuration_varied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten times the noise that fixes claim: the track must feel it. Another bag under the same name is refused."""
-    bag, config = write_bag(simulate(Scenario(duration_s=10.0), 3), tmp_path / "bag", ros=2)
+    bag, config = write_bag(
+        simulate(Scenario(duration_s=10.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3), tmp_path / "bag", ros=2
+    )
     job = Job(bag=str(bag), config=str(config))
     jobs = [replace(job, config_changes=(("sensors.gnss.sigma_scale", k),)) for k in ("1", "10")]
     monkeypatch.setattr(sweep, "_on_dask", in_process([]))

@@ -50,7 +50,7 @@ def made_comparable(run: Run) -> Run:
             return False
         return True
 
-    if truth is not None and not comparable(metrics.errors, track, truth):
+    if truth is not None and not comparable(metrics.common_stamps, track, truth):
         truth = None
     if speed is not None and not comparable(metrics.compare_speed, track, speed):
         speed = None
@@ -58,7 +58,7 @@ def made_comparable(run: Run) -> Run:
         held = ()
 
     def fits(filtered: ekf.FilterResult) -> bool:
-        return (truth is None or comparable(metrics.errors, filtered.trajectory, truth)) and (
+        return (truth is None or comparable(metrics.common_stamps, filtered.trajectory, truth)) and (
             not held
             or comparable(
                 metrics.held_out_errors, filtered.trajectory, held, run.solution.datum, antennas(run).configured
@@ -67,7 +67,7 @@ def made_comparable(run: Run) -> Run:
 
     filters = tuple(f for f in run.filters if fits(f))
     online = run.online
-    if online is not None and not comparable(metrics.errors, online.trajectory, track):
+    if online is not None and not comparable(metrics.common_stamps, online.trajectory, track):
         online = None
     recording = replace(run.recording, truth=truth, check_speed=speed, warnings=(*run.recording.warnings, *said))
     return replace(run, recording=recording, held=held, filters=filters, online=online)

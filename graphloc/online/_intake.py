@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -139,7 +140,7 @@ class ImuIntake:
 
     def _absurd(self, m: ImuSample) -> str:
         """Return why a sample cannot be a reading of a vessel; empty where it can."""
-        force, rate = float(np.linalg.norm(m.accel_mps2)), float(np.linalg.norm(m.gyro_radps))
+        force, rate = math.sqrt(m.accel_mps2 @ m.accel_mps2), math.sqrt(m.gyro_radps @ m.gyro_radps)
         if (self._floats and force < _FORCE_MPS2[0]) or force > _FORCE_MPS2[1]:
             return f"a specific force of {force:.3g} m/s^2, impossible for a vessel: wrong unit?"
         return f"a rate of {rate:.3g} rad/s, impossible for a vessel: wrong unit?" if rate > _RATE_RADPS else ""

@@ -59,7 +59,9 @@ class Odometry:
         cov[3:, 3:] += self.R @ noise[:3, :3] @ self.R.T
         self.p_m, R = self.after(dp_body_m, dR)
         up = R @ R_world_body[2]  # up as estimated in world, seen in odom; it should be z there, too
-        lean = np.cross(up, np.array([0.0, 0.0, 1.0])) * min(dt_s / _LEAN_S, 1.0)
+        lean = np.array([up[1], -up[0], 0.0]) * min(
+            dt_s / _LEAN_S, 1.0
+        )  # up x z: `np.cross` takes as long as all else here
         size = float(np.linalg.norm(lean))
         lean *= min(1.0, _LEAN_RAD / size) if size > 0.0 else 1.0
         self.R = np.asarray(Rotation.from_rotvec(lean).as_matrix() @ R)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
+from statistics import median
 
 import numpy as np
 
@@ -60,9 +61,9 @@ class Scatter:
         if before is not None:
             self._pairs.append(0.5 * float((residual - before) @ (residual - before)))
         if len(self._pairs) >= len(residual) + SPARE:
-            about, usual = np.median(self._squares), chi2_median(len(residual))
-            least = about if self._jumps else min(about, np.median(self._pairs))
+            about, usual = median(self._squares), chi2_median(len(residual))
+            least = about if self._jumps else min(about, median(self._pairs))
             self.times = max(1.0, float(np.sqrt(least / usual)))
             if len(self._bent) >= _FEWEST_BENT:
-                white = float(np.sqrt(np.median(self._bent) / usual))
+                white = float(np.sqrt(median(self._bent) / usual))
                 self.noisier = noisier_than_stated(min(self.times, white))

@@ -163,7 +163,7 @@ def _drawn_anew(case: _Case) -> list[_Span]:
     found: list[_Span] = []
     for stream in case.streams:
         stamps_ns = stamps_of(stream.measurements)
-        back = np.searchsorted(stamps_ns, case.problem.timeline.slow_stamps_ns[stream.anew + 1])
+        back = np.searchsorted(case.problem.timeline.slow_of[stream.state], stream.anew, side="right")
         gaps: list[tuple[int, int] | None] = [(int(stamps_ns[n - 1]), int(stamps_ns[n])) for n in back]
         for gap_ns, next_ns in pairwise([*gaps, None]):
             assert gap_ns is not None
