@@ -88,7 +88,8 @@ def _why_no_receiver(recording: Recording, config: VesselConfig) -> str:
     if unread:
         told = "`graphloc inspect` says whether its fixes can be used"
         return f": vessel.yaml has none for {', '.join(unread)}; {told}. Add it, or set datum: in vessel.yaml"
-    return "; set datum: in vessel.yaml"
+    # Those in world were asked for their datum before.
+    return ", nor another that measures position (matches, tags, poses): without one the vessel cannot be placed"
 
 
 def refuse_world_without_datum(config: VesselConfig, where: str, rows: Sequence[Sensor]) -> None:

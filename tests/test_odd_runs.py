@@ -258,6 +258,15 @@ def test_no_receiver_to_take_a_datum_from_says_why() -> None:
             app.choose_datum(recording, VesselConfig(sensors=sensors))
 
 
+def test_where_nothing_measures_position_no_datum_is_asked_for() -> None:
+    """Of a robot with LiDAR and odometry alone it was, and with it the run ended in another error."""
+    recording = Recording(source="my.bag", imu=None, measurements=())
+    with pytest.raises(InputError, match="nor another that measures position"):
+        app.choose_datum(recording, VesselConfig(sensors={"height": HeightConfig()}))
+    with pytest.raises(InputError, match="set datum:"):
+        app.choose_datum(recording, VesselConfig(sensors={"matches": PoseConfig(topic="/pose")}))
+
+
 def test_fixes_without_a_stamp_are_counted_by_their_reason() -> None:
     """When each was recorded is no reason of its own, and a row may stand for many: '1 messages' were said."""
     rows = tuple(
