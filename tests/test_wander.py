@@ -153,9 +153,9 @@ def test_fixes_that_wander_are_drafted_as_fast_as_they_do(sigma: float, tmp_path
         m.latitude, m.longitude = float(lat), float(lon)
     for topic, stamp, m in items:
         if topic == "/wheel/odom":
-            m.pose.pose.position.x, m.pose.pose.position.y = (
-                float(np.interp(stamp, stamps, enu[:, axis])) for axis in (1, 0)
-            )
+            # In a frame of its own: one that is that of the fixes, east or north ahead, is a filter's.
+            east, north = (float(np.interp(stamp, stamps, enu[:, axis])) for axis in (0, 1))
+            m.pose.pose.position.x, m.pose.pose.position.y = 0.8 * east - 0.6 * north, 0.6 * east + 0.8 * north
     found, config, text = look(tmp_path, items, make)
     receiver, wheels = config.sensors["gnss"], config.sensors["wheels"]
     assert isinstance(receiver, GnssConfig)
