@@ -135,7 +135,7 @@ def scale_warning(imu: ImuSeries, sensor: str, yaws: Yaws) -> list[str]:
     more = f"{times:.1f} times less" if times > 1.0 else f"{1.0 / times:.1f} times more"
     said = f"{imu.sensor}: its gyro turns {more} than the headings of {sensor}, in step with them: its rates are neither in rad/s nor in deg/s"
     return [
-        f"{said} (a driver that takes another range for the gyroscope's), which no key corrects; or these headings are in another unit"
+        f"{said} (a driver that takes another range for the gyroscope's), which no key corrects; or these headings are in another unit, or off by 20 deg or more in iron"
     ]
 
 

@@ -25,7 +25,7 @@ from graphloc.linear import factors_of
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.online._lag import Lag
 from graphloc.online._live import LiveStream, ReceiverDetectors
-from graphloc.online._receiver_checks import _antenna
+from graphloc.online._receiver_checks import ReceiverChecks, _antenna
 from graphloc.replay import replay
 from tests.faults import Fed, arrivals_of, feed
 from tests.slowly import with_few_states
@@ -110,6 +110,30 @@ def test_online_a_receiver_is_judged_at_the_antenna_as_estimated() -> None:
     there = replace(at, lever_m=at.lever_m + at.T_state_sensor.rotation().matrix() @ OFF_M)
     np.testing.assert_allclose(v_mps, there.sensor_velocity_mps(), atol=1e-9)
     assert np.linalg.norm(v_mps - at.sensor_velocity_mps()) > 0.05
+
+
+def test_online_that_antenna_is_what_a_receiver_is_asked_of() -> None:
+    """Both by whether it repeats a fix and by whether it stands."""
+    at = displacing(attachment(gnss.ROW, GNSS, slow=False), np.array([0.07, *OFF_M]))
+    noted: list[tuple[Any, ...]] = []
+    repeats = SimpleNamespace(note=lambda *told: noted.append(told), is_old=lambda *_: False)
+    stands = SimpleNamespace(frozen=True, note=lambda *told: noted.append(told), for_long=lambda _: False)
+    stream: Any = SimpleNamespace(
+        row=gnss.ROW,
+        constants=gnss.ROW.constants(GNSS),
+        receiver=SimpleNamespace(repeated_fix=repeats),
+        frozen_detector=stands,
+    )
+    newest = SimpleNamespace(velocity=np.full(3, 100.0), velocity_cov=np.eye(3))
+    problem: Any = SimpleNamespace(datum=at.datum, timeline=SimpleNamespace(seconds=lambda _: 0.0))
+    unused: Any = None
+    checks = ReceiverChecks(problem, cast("Any", SimpleNamespace(newest=newest)), unused, unused)
+    m = gnss.ROW.ideal(at, GNSS)
+    assert "frozen" in checks.reject(stream, m, at, gnss.ROW.residuals(m, GNSS, at)[0])
+    (_, _, body_mps, _), (_, _, there_m, *_) = noted
+    place_m, v_mps = _antenna(stream, at)
+    np.testing.assert_allclose(there_m, place_m)
+    np.testing.assert_allclose(body_mps, (at.T_world_body.rotation().matrix().T @ v_mps)[:2])
 
 
 def yaw_errors_deg(run: SimulatedRun, fed: Fed) -> Array:

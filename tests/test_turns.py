@@ -4,6 +4,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +26,7 @@ from graphloc.frontends._turns import (
     wander_deg,
     wander_warning,
 )
-from graphloc.frontends.bag import read_recording
+from graphloc.frontends.bag import _turn_warnings, read_recording
 from graphloc.frontends.inspect import inspect_bag
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries
 from graphloc.time import stamps_of
@@ -249,6 +251,29 @@ def test_rates_in_no_unit_are_said(times: float, run: SimulatedRun) -> None:
     lines = scale_warning(replace(imu, gyro_radps=times * imu.gyro_radps), "compass", told_by(run, "compass"))
     said = f"{max(times, 1.0 / times):.1f} times {'more' if times > 1.0 else 'less'} than the headings of compass"
     assert [said in line for line in lines] == ([True] if times not in (1.0, 1.25) else [])
+
+
+@pytest.mark.parametrize(("deviation_deg", "said"), [(15.0, False), (30.0, True)])
+def test_a_compass_in_iron_that_looks_like_another_range_is_named(
+    deviation_deg: float, said: bool, run: SimulatedRun
+) -> None:
+    """Of a craft that weaves to either side of where its compass turns least: by half of what it does, in step with the gyroscope."""
+    imu, _ = of(run)
+    t_s = (imu.stamps_ns - imu.stamps_ns[0]) / S
+    by_rad = np.radians(40.0) * np.sin(0.1 * t_s)
+    up = np.array([0.0, 0.0, 1.0])
+    imu = replace(imu, accel_mps2=np.tile(9.81 * up, (len(t_s), 1)), gyro_radps=np.gradient(by_rad, t_s)[:, None] * up)
+    compass = by_rad - np.radians(deviation_deg) * np.sin(by_rad)
+    at = np.arange(0, len(t_s), 50)
+    headings = [
+        CompassHeading(
+            stamp_ns=int(imu.stamps_ns[i]), sensor="compass", seq=int(i), yaw_rad=float(compass[i]), sigma_rad=0.02
+        )
+        for i in at
+    ]
+    readings: Any = SimpleNamespace(sensor="compass", config=None, values=headings, stamps=lambda: imu.stamps_ns[at])
+    lines = _turn_warnings(imu, [readings])
+    assert ["or off by 20 deg or more in iron" in line for line in lines] == [True] * said
 
 
 @pytest.mark.parametrize("seed", range(20))
