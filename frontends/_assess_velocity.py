@@ -243,8 +243,8 @@ def _fused(topic: str, world: World) -> str:
     if _INS.search(topic):
         return "an INS's output by its name"
     if world.grid or world.centred or world.ned or world.origin is not None:
-        frame = "a map grid" if world.grid else "earth-centred" if world.centred else "east-north-up about the fixes"
-        frame = "north, east, down" if world.ned else frame
+        known = {"a map grid": world.grid, "earth-centred": world.centred, "north, east, down": world.ned}
+        frame = next((frame for frame, is_it in known.items() if is_it), "east-north-up about the fixes")
         return f"an INS's or a filter's output, as its frame is {frame}, which no wheels know"
     return ""
 

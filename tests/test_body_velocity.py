@@ -38,6 +38,9 @@ from tests.slowly import simulate_slowly
 
 MAKE = Messages(2)
 KNOT_MPS = 1852.0 / 3600.0
+LOOPS_OVER_GROUND = Scenario(
+    path="loops", imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, pose_hz=0.0, log_through="ground",
+)  # fmt: skip
 
 
 def decode(msg: Any, config: BodyVelocityConfig, msgtype: str = "") -> Any:
@@ -171,16 +174,7 @@ def test_the_batch_finds_the_current() -> None:
 
 def test_online_what_is_faster_than_it_errs_anew_is_thinned() -> None:
     """At 50 Hz every third is used; the others have a row, and no factor."""
-    scenario = Scenario(
-        path="loops",
-        duration_s=20.0,
-        gnss_hz=2.0,
-        imu_hz=50.0,
-        compass_hz=2.0,
-        pose_hz=0.0,
-        log_hz=50.0,
-        log_through="ground",
-    )
+    scenario = replace(LOOPS_OVER_GROUND, duration_s=20.0, log_hz=50.0)
     run = simulate_slowly(scenario, 3)
     said = [m for m in run.recording.measurements if isinstance(m, BodyVelocity)]
     rows = list(replay(run.recording, run.config).solution.ledger)
@@ -207,16 +201,7 @@ def on_wheels(run: SimulatedRun, off_m: float, turned_deg: float) -> Recording:
 
 def test_the_batch_finds_where_wheels_sit_and_how_they_are_turned() -> None:
     """A place 1.2 m abaft of where it is taken to be and turned by 2 deg."""
-    scenario = Scenario(
-        path="loops",
-        duration_s=120.0,
-        gnss_hz=2.0,
-        imu_hz=50.0,
-        compass_hz=2.0,
-        pose_hz=0.0,
-        log_hz=5.0,
-        log_through="ground",
-    )
+    scenario = replace(LOOPS_OVER_GROUND, duration_s=120.0, log_hz=5.0)
     run = simulate_slowly(scenario, 3)
     block = configured(topic="/log", axes=["x", "y"], mount_sigma_m=1.5, mount_sigma_deg=2.0)
     config = run.config.model_copy(update={"sensors": {**run.config.sensors, "log": block}})
@@ -231,16 +216,7 @@ def test_the_batch_finds_where_wheels_sit_and_how_they_are_turned() -> None:
 
 def test_the_better_filter_is_told_that_the_mount_of_wheels_is_not_known() -> None:
     """As the graph is: else the comparison flatters the graph (6.7 m beside 2.4 m)."""
-    scenario = Scenario(
-        path="loops",
-        duration_s=90.0,
-        gnss_hz=2.0,
-        imu_hz=50.0,
-        compass_hz=2.0,
-        pose_hz=0.0,
-        log_hz=5.0,
-        log_through="ground",
-    )
+    scenario = replace(LOOPS_OVER_GROUND, duration_s=90.0, log_hz=5.0)
     run = simulate_slowly(scenario, 7)
     recording = on_wheels(run, -3.0, 4.0)
 
@@ -259,16 +235,7 @@ def test_the_better_filter_is_told_that_the_mount_of_wheels_is_not_known() -> No
 @pytest.mark.parametrize(("factor", "cure"), [(3.6, "check its unit"), (-1.0, "turn its mount by 180 deg")])
 def test_a_wrong_unit_or_sign_is_named(factor: float, cure: str) -> None:
     """Kilometres an hour, read as metres a second; and wheels that count backwards."""
-    scenario = Scenario(
-        path="loops",
-        duration_s=60.0,
-        gnss_hz=2.0,
-        imu_hz=50.0,
-        compass_hz=2.0,
-        pose_hz=0.0,
-        log_hz=2.0,
-        log_through="ground",
-    )
+    scenario = replace(LOOPS_OVER_GROUND, duration_s=60.0, log_hz=2.0)
     run = simulate_slowly(scenario, 3)
 
     def otherwise(m: Any) -> Any:
@@ -285,16 +252,7 @@ def test_a_wrong_unit_or_sign_is_named(factor: float, cure: str) -> None:
 
 def test_wheels_that_are_turned_are_said_to_be_so() -> None:
     """By 3.6 deg, of a mount that is good to 1 deg, beside a compass that is good to 1 deg."""
-    scenario = Scenario(
-        path="loops",
-        duration_s=60.0,
-        gnss_hz=2.0,
-        imu_hz=50.0,
-        compass_hz=2.0,
-        pose_hz=0.0,
-        log_hz=2.0,
-        log_through="ground",
-    )
+    scenario = replace(LOOPS_OVER_GROUND, duration_s=60.0, log_hz=2.0)
     run = simulate_slowly(scenario, 3)
     turned = np.radians(3.6)
 

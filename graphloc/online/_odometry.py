@@ -59,9 +59,8 @@ class Odometry:
         cov[3:, 3:] += self.R @ noise[:3, :3] @ self.R.T
         self.p_m, R = self.after(dp_body_m, dR)
         up = R @ R_world_body[2]  # up as estimated in world, seen in odom; it should be z there, too
-        lean = np.array([up[1], -up[0], 0.0]) * min(
-            dt_s / _LEAN_S, 1.0
-        )  # up x z: `np.cross` takes as long as all else here
+        # up x z written out: `np.cross` takes as long as all else here.
+        lean = np.array([up[1], -up[0], 0.0]) * min(dt_s / _LEAN_S, 1.0)
         size = float(np.linalg.norm(lean))
         lean *= min(1.0, _LEAN_RAD / size) if size > 0.0 else 1.0
         self.R = np.asarray(Rotation.from_rotvec(lean).as_matrix() @ R)
