@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Online, in a loop of one's own: feed what arrives, ask for the pose when it is needed."""
 
+from graphloc import ImuSample, online_smoother
 from graphloc.eval.simulate import find_scenario, simulate
-from graphloc.factors import INERTIAL, SENSORS
-from graphloc.measurements import ImuSample
-from graphloc.online import OnlineSmoother
 from graphloc.replay import arrivals
 
 run = simulate(find_scenario("bl1-drift", {"duration_s": "30"}), seed=1)  # a vessel has its drivers instead
-smoother = OnlineSmoother(run.config, rows=SENSORS, inertial=INERTIAL)
+smoother = online_smoother(run.config)
 
 for number, measurement in enumerate(arrivals(run.recording)):  # in order of arrival, late ones among them
     estimate = smoother.feed(measurement)  # a new state about ten times a second, else None

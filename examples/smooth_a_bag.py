@@ -5,14 +5,15 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from graphloc import app
+from graphloc import Scans, load, smooth_recording
 from graphloc.frames import heading_deg_from_yaw
 from graphloc.time import utc_text
 from graphloc.trajectory import bounds_95
 
 bag, config_path = Path(sys.argv[1]), Path(sys.argv[2])
-recording, config = app.load([bag], config_path)
-solution = app.smooth_recording(recording, config, scans=app.Scans((bag,), config_path.parent)).solution
+recording, config = load(bag, config_path)
+run = smooth_recording(recording, config, scans=Scans((bag,), config_path.parent))
+solution = run.solution  # graphloc.write(run, folder) makes the run folder with the report
 
 track = solution.trajectory  # body in world (east, north, up), about ten poses a second
 places = solution.datum.geodetic_from_enu(track.p_world_m)

@@ -18,7 +18,7 @@ from ruamel.yaml.error import YAMLWarning
 from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
 
 from graphloc.errors import ConfigError
-from graphloc.frames import Array, rotation_from_rpy_deg
+from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation
 
 _LEAST, _MOST = 1e-12, 1e12  # of any length, angle or time: squares and inverses of it are numbers, too
 
@@ -68,6 +68,12 @@ class MountConfig(Block):
     def R_body_sensor(self) -> Array:
         """Rotation (3, 3) that takes sensor coordinates to body."""
         return rotation_from_rpy_deg(np.array(self.rpy_deg))
+
+    @classmethod
+    def of_pose(cls, t_body_sensor_m: Array, R_body_sensor: Array) -> MountConfig:
+        """Return it in numbers, as it is in no /tf_static."""
+        xyz_m, rpy_deg = t_body_sensor_m, np.degrees(rpy_from_rotation(R_body_sensor)) + 0.0  # no -0.0
+        return cls(xyz_m=tuple(xyz_m.tolist()), rpy_deg=tuple(rpy_deg.tolist()))
 
 
 def nearest(key: str, known: list[str]) -> str:

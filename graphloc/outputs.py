@@ -52,7 +52,7 @@ def write_run(
     """Write all files of a run but the report into an existing folder.
 
     Args:
-        folder: where to. solution: what to write. config: its effective form goes along.
+        folder: where to. solution: what to write. config: its effective form goes along, its mounts in numbers.
         inputs: SHA-256 of each input. command: the command line. metrics: tables as plain data.
         warnings: all that the report shows. span: which part of the bag it is.
     """

@@ -105,6 +105,10 @@ class Recording:
     span: Span | None = None
     clock_doubts: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        imu = "no IMU" if self.imu is None else f"{len(self.imu)} samples of {self.imu.sensor}"
+        return f"<Recording of {self.source}: {imu}, {len(self.measurements)} measurements of {self.message_count} messages>"
+
     def of(self, kind: type[_M], sensor: str | None = None) -> list[_M]:
         """Return its measurements of a class, in order: all, or those of one sensor."""
         return [m for m in self.measurements if isinstance(m, kind) and sensor in (None, m.sensor)]

@@ -251,7 +251,8 @@ def _refuse(config: VesselConfig, where: str) -> None:
     for name, sensor in enabled.items():
         if sensor.mount.tf_frame:
             raise ConfigError(
-                f"{where}: sensors.{name}.mount.tf_frame: a stream has no /tf_static; give xyz_m and rpy_deg"
+                f"{where}: sensors.{name}.mount.tf_frame: a stream has no /tf_static; give xyz_m and rpy_deg, or take the "
+                "vessel.effective.yaml that `graphloc smooth` writes beside its results: there mounts are in numbers"
             )
         if sensor.kind in ("aerial", "apriltag"):
             log.warning("%s: sensors.%s: a stream has no line for kind %s; it stays silent", where, name, sensor.kind)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -891,14 +892,17 @@ def test_raised_noise_is_resumed_while_adapt_noise_is_on(tmp_path: Path, saved: 
     assert json.loads(path.read_text(encoding="utf-8"))["noise"] == ([2.0, 3.0, 4.0] if adapt else [1.0, 1.0, 1.0])
 
 
-def test_an_old_snapshot_is_not_resumed(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("later_s", "why"), [(60, r"[\d.]+ s old, more than the 20 s"), (-60, r"[\d.]+ s newer than the first IMU sample")]
+)
+def test_an_old_snapshot_is_not_resumed(tmp_path: Path, later_s: int, why: str) -> None:
     path, base = tmp_path / "snapshot.json", arrivals_of(run_of())
     feed(smoother(run_of(), snapshot=path), run_of(), base[: at_s(base, 6.0)])
-    later = [replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns + 60_000_000_000)) for a in base[: at_s(base, 7.0)]]
+    later = [replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns + later_s * 10**9)) for a in base[: at_s(base, 7.0)]]
     online = smoother(run_of(), snapshot=path)
     fed = finish(online, feed(online, run_of(), later))
     assert complaints(later, fed) == []
-    assert [e for e in fed.events if "s old, more than the 20 s" in e]
+    assert [e for e in fed.events if re.search(rf"the snapshot is {why}", e)]
     assert fed.estimates
 
 

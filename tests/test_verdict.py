@@ -252,12 +252,21 @@ def test_when_it_was_less_than_good(data: ReportData) -> None:
 def test_what_would_end_it_is_reported_of_the_cause() -> None:
     known, unknown = np.eye(6) * 1e-4, np.eye(6) * 100.0
     away = {"compass": 20.0, "gnss": 12.0, "match": 1.0}
-    assert cure(*health_of(known, away)).startswith("compass, gnss agreeing again")
-    assert "for the heading" in cure(*health_of(unknown, {"gnss": 1.0}))
-    assert "fix" in cure(*health_of(known, {"gnss": 6.0}))
-    assert "second position sensor" in cure(*health_of(np.diag([4.0, 4.0, 1.0, 1e-4, 1e-4, 1e-4]), {"gnss": 1.0}))
-    assert "warnings" in cure(*health_of(known, {"gnss": 1.0}, "the measurements contradict each other"))
+    assert cure(*health_of(known, away, 2.5)).startswith("compass, gnss agreeing again")
+    assert "for the heading" in cure(*health_of(unknown, {"gnss": 1.0}, 2.5))
+    assert "fix" in cure(*health_of(known, {"gnss": 6.0}, 2.5))
+    assert "second position sensor" in cure(*health_of(np.diag([4.0, 4.0, 1.0, 1e-4, 1e-4, 1e-4]), {"gnss": 1.0}, 2.5))
+    assert "warnings" in cure(*health_of(known, {"gnss": 1.0}, 2.5, "the measurements contradict each other"))
     assert "start.heading_deg" in cure(Health.LOST, HealthReason("in whatever words", Cause.GUESSED_HEADING))
+
+
+@pytest.mark.parametrize(
+    ("good_bound_m", "health"), [(2.5, Health.DEGRADED), (4.8, Health.DEGRADED), (4.95, Health.GOOD)]
+)
+def test_how_wide_a_bound_is_good_is_configured(good_bound_m: float, health: Health) -> None:
+    """2 m (1 sigma) each way are 4.9 m with 95 %."""
+    cov = np.diag([4.0, 4.0, 1.0, 1e-4, 1e-4, 1e-4])
+    assert health_of(cov, {"gnss": 1.0}, good_bound_m)[0] is health
 
 
 @pytest.mark.parametrize(

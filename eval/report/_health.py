@@ -89,7 +89,9 @@ def cure(health: Health, reason: HealthReason) -> str:
     if reason.cause is Cause.SENSORS:
         return f"{', '.join(reason.sensors)} agreeing again; the ledger says what became of its measurements"
     if reason.cause is Cause.BOUND:
-        return "a better fix, or a second position sensor (match, tag)"
+        return (
+            "a better fix, or a second position sensor (match, tag); where a wider bound will do, output.good_bound_m"
+        )
     return "correcting what the warnings name: noise, mounts, stamps"
 
 

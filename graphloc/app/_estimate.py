@@ -28,7 +28,8 @@ from graphloc.frozen_receiver import without_frozen_fixes
 from graphloc.gather import Matches, Scans, with_matches, with_sightings, with_surveys
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.offsets import Probe
-from graphloc.recording import Progress, Recording, quiet
+from graphloc.online import OnlineSmoother
+from graphloc.recording import Mounts, Progress, Recording, quiet
 from graphloc.replay import Status, replay, silent
 from graphloc.solution import Solution
 from graphloc.solve import smooth
@@ -39,12 +40,13 @@ _GAINS = 0.9  # of those beyond reach, that may be left for it to be worth its t
 _FEWEST_MATCHES = 5  # used, without which a track is no better to match around than the one before
 
 
-def configured(config_path: Path, changes: Mapping[str, object] = MappingProxyType({})) -> VesselConfig:
+def configured(config_path: Path | str, changes: Mapping[str, object] = MappingProxyType({})) -> VesselConfig:
     """Read a vessel.yaml with the surveys that it names, some of its keys changed (`config.with_changes`).
 
     Raises:
         ConfigError: it or a survey cannot be used.
     """
+    config_path = Path(config_path)
     config = with_surveys(load_config(config_path, KINDS, changes), config_path.parent)
     origin.refuse_world_without_datum(config, str(config_path), SENSORS)
     return config
@@ -52,7 +54,7 @@ def configured(config_path: Path, changes: Mapping[str, object] = MappingProxyTy
 
 def load(
     bags: Bags,
-    config_path: Path,
+    config_path: Path | str,
     progress: Progress = quiet,
     changes: Mapping[str, object] = MappingProxyType({}),
 ) -> tuple[Recording, VesselConfig]:
@@ -60,6 +62,27 @@ def load(
     config = configured(config_path, changes)
     recording = read_recording(bags, config, progress)
     return with_sightings(recording, config, bags, progress), config
+
+
+def online_smoother(
+    config: VesselConfig,
+    *,
+    mounts: Mounts = MappingProxyType({}),
+    datum: Datum | None = None,
+    lag_s: float = 10.0,
+    snapshot: Path | None = None,
+) -> OnlineSmoother:
+    """Return the online mode for all kinds of sensors that graphloc knows.
+
+    Args:
+        config, mounts, datum, lag_s, snapshot: as of `OnlineSmoother`. mounts: `Recording.mounts`, where they come from /tf_static.
+
+    Raises:
+        InputError: a mount is missing, or the origin of something that is given in world.
+    """
+    return OnlineSmoother(
+        config, rows=SENSORS, inertial=INERTIAL, mounts=mounts, datum=datum, lag_s=lag_s, snapshot=snapshot
+    )
 
 
 def smooth_recording(

@@ -99,15 +99,30 @@ def report_data(run: Run, command: str = "") -> report.ReportData:
 
 
 def write(
-    run: Run, folder: Path, *, inputs: Sequence[Path], command: str, overwrite: bool, figures: bool = False
+    run: Run,
+    folder: Path | str,
+    *,
+    inputs: Sequence[Path] = (),
+    command: str = "",
+    overwrite: bool = False,
+    figures: bool = False,
 ) -> Path:
-    """Write the run folder with its report, and its figures as PNG and SVG if asked; return the report's path."""
+    """Write the run folder with its report, and its figures as PNG and SVG if asked; return the report's path.
+
+    Args:
+        inputs: files whose SHA-256 goes into `run.json`. command: what made the run, for `run.json` and the report.
+        overwrite: replace the folder of an earlier run.
+
+    Raises:
+        OutputError: it is there already, or cannot be written.
+    """
+    folder = Path(folder)
     data = report_data(run, command)
     with fresh_folder(folder, overwrite=overwrite, mark=outputs.MARK) as fresh:
         outputs.write_run(
             fresh,
             run.solution,
-            run.config,
+            run.config.with_mounts(run.recording.mounts),
             inputs={str(p): sha256(p) for p in inputs},
             command=command,
             metrics={t.title: t.as_dict() for t in data.tables},

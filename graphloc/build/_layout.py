@@ -16,6 +16,7 @@ from graphloc.build._chains import silent_s, without_drift
 from graphloc.build._problem import PositionJumps, Problem, Stream, apart_s_of, inertial_factors, preintegrate
 from graphloc.build._usable import silent_sensors, sorted_out, usable_imu
 from graphloc.config import SensorConfig, VesselConfig
+from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
 from graphloc.graph import InertialLink, InertialRow, Sensor, SlowProcess
 from graphloc.measurements import Measurement
@@ -29,7 +30,16 @@ _NO_JUMPS: PositionJumps = np.zeros(0, dtype=np.int64), np.zeros(0)
 
 
 def mount_of(name: str, config: SensorConfig, mounts: Mounts) -> tuple[Array, Array]:
-    """Return the mount of a sensor in body (t (3,), m; R (3, 3)): from /tf_static where configured so."""
+    """Return the mount of a sensor in body (t (3,), m; R (3, 3)): from /tf_static where configured so.
+
+    Raises:
+        InputError: it is configured so, and not among these mounts.
+    """
+    if config.mount.tf_frame and name not in mounts:
+        raise InputError(
+            f"sensors.{name}.mount.tf_frame: no /tf_static is read here, and no mount of {name} is given (`mounts`); give xyz_m and "
+            "rpy_deg instead, as in the vessel.effective.yaml of a run of the bag"
+        )
     return mounts.get(name) or (config.mount.t_body_sensor_m, config.mount.R_body_sensor)
 
 

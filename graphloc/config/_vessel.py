@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
 
-from graphloc.blocks import Block, Finite, Positive
+from graphloc.blocks import Block, Finite, MountConfig, Positive
 from graphloc.config._sensor import SensorConfig
-from graphloc.frames import Geodetic
+from graphloc.frames import Array, Geodetic
 
 
 class DatumConfig(Block):
@@ -54,8 +54,10 @@ class StartConfig(Block):
 
 
 class OutputConfig(Block):
-    """What is written to the run folder."""
+    """What is written to the run folder, and what is called good."""
 
+    good_bound_m: Annotated[float, Field(gt=0.0, le=25.0)] = 2.5
+    """A pose whose 95 % bound is larger is `degraded`, m. DNV asks for 2.5 m in port (Digerud); in open water more may do."""
     rate_hz: Annotated[float, Field(gt=0.0, le=1e4)] = 10.0
     """Rows per second in the solution."""
     bag: bool = True
@@ -149,6 +151,12 @@ class VesselConfig(Block):
     def with_sensors(self, changed: Mapping[str, Any]) -> VesselConfig:
         """Return the configuration with some of its sensors replaced."""
         return self.model_copy(update={"sensors": {**self.sensors, **changed}})
+
+    def with_mounts(self, mounts: Mapping[str, tuple[Array, Array]]) -> VesselConfig:
+        """Return the configuration with mounts (t (3,), m; R (3, 3)) of sensors in numbers, not by the names of their frames."""
+        own = {name: self.sensors[name] for name in mounts if name in self.sensors}
+        numbers = {name: MountConfig.of_pose(*mounts[name]) for name in own}
+        return self.with_sensors({name: s.model_copy(update={"mount": numbers[name]}) for name, s in own.items()})
 
     def scaled(self, times: Mapping[str, Mapping[str, float]]) -> VesselConfig:
         """Return the configuration with numbers of sensors so many times as large; `times`: by sensor and key."""

@@ -59,7 +59,7 @@ def estimate_of(
     widen_heading(cov, heading_var)
     limit_heading(cov)
     since = {n: max((at_ns - agreed_ns[n]) * 1e-9, 0.0) if n in agreed_ns else np.inf for n in absolute}
-    health, reason = health_of(cov, of_receivers(since, problem.config), doubt)
+    health, reason = health_of(cov, of_receivers(since, problem.config), problem.config.output.good_bound_m, doubt)
     if doubt and reason.text != doubt:
         reason = replace(reason, text=f"{reason}; {doubt}")
     if guess:

@@ -12,7 +12,9 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
+from graphloc.build import mount_of
 from graphloc.config import VesselConfig
 from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate, Event
@@ -52,12 +54,12 @@ class OnlineSmoother:
     Args:
         config: the vessel, its surveys read. rows, inertial: the table of sensors (`graphloc.factors`).
         datum: origin of world; None: from the configuration, or else from the first fixes.
-        mounts: body -> sensor (t (3,), R (3, 3)) of sensors whose mount is not the configuration's (/tf_static).
+        mounts: body -> sensor (t (3,), R (3, 3)) of sensors whose mount is not the configuration's (`tf_frame`, of /tf_static).
         lag_s: how long measurements can still be re-judged, and how late they may come.
         snapshot: file that is written every few seconds, and resumed from if it is there; None: no such file.
 
     Raises:
-        InputError: something is given in world, and nothing says where its origin is.
+        InputError: something is given in world, and nothing says where its origin is; or a mount is that of a frame, and not in `mounts`.
     """
 
     def __init__(
@@ -67,18 +69,22 @@ class OnlineSmoother:
         rows: Sequence[Sensor],
         inertial: InertialRow,
         datum: Datum | None = None,
-        mounts: Mounts | None = None,
+        mounts: Mounts = MappingProxyType({}),
         lag_s: float = 10.0,
         snapshot: Path | None = None,
     ) -> None:
         if datum is None:
             refuse_world_without_datum(config, "vessel.yaml", rows)
-        setup = Setup(config=config, rows=tuple(rows), inertial=inertial, mounts=dict(mounts or {}), lag_s=lag_s)
+        for name, sensor in config.sensors.items():
+            if sensor.enabled:
+                mount_of(name, sensor, mounts)
+        setup = Setup(config=config, rows=tuple(rows), inertial=inertial, mounts=dict(mounts), lag_s=lag_s)
         self._setup, imu = setup, setup.imu
         self._persistent = PersistentState(
             datum=datum or (Datum(config.datum.geodetic) if config.datum else None), noise=self._configured_noise()
         )
         self._ledger = OnlineLedger(config)
+        self._ignored: set[str] = set()  # names of sensors, said once
         self._events: list[Event] = []
         self._thinnings = {n: Thinning(apart_ns) for n, apart_ns in setup.apart_ns.items()}
         self._intake = ImuIntake(setup.gap_s, imu is not None and imu.gravity != "removed")
@@ -173,7 +179,7 @@ class OnlineSmoother:
         if isinstance(m, ImuSample):
             return self._feed_imu(m)
         if m.sensor not in self._setup.measuring:
-            self._ledger.drop(m, Outcome.IGNORED, _NOT_ASKED)
+            self._ignore(m, _NOT_ASKED)
             return None
         if self._thinnings[m.sensor].drops(m.stamp_ns):
             self._ledger.drop(m, Outcome.REJECTED, THINNED)
@@ -194,11 +200,17 @@ class OnlineSmoother:
             tracking.keep(m)
         return None
 
+    def _ignore(self, m: Measurement, why: str) -> None:
+        self._ledger.drop(m, Outcome.IGNORED, why)
+        if m.sensor not in self._setup.config.sensors and m.sensor not in self._ignored:  # misspelt?
+            self._ignored.add(m.sensor)
+            self._say(f"{m.sensor}: its messages are ignored: no sensor has this name in the configuration")
+
     def _feed_imu(self, m: ImuSample) -> Estimate | None:
         if m.sensor != self._setup.imu_name:
             sensor = self._setup.config.sensors.get(m.sensor)
             other = sensor is not None and sensor.enabled and self._setup.imu_name
-            self._ledger.drop(m, Outcome.IGNORED, f"{other} is the IMU" if other else _NOT_ASKED)
+            self._ignore(m, f"{other} is the IMU" if other else _NOT_ASKED)
             return None
         taken = self._intake.take(m, started=self._tracking is not None)
         for lost, why in taken.dropped:
@@ -438,7 +450,11 @@ class OnlineSmoother:
         assert self._resumable is not None
         found, self._resumable, setup = self._resumable, None, self._setup
         age_s, bridge_s = (newest.stamp_ns - found.anchor.stamp_ns) * 1e-9, setup.bridge_s
-        if not 0.0 < age_s <= bridge_s:
+        if age_s <= 0.0:
+            self._say(f"the snapshot is {-age_s:.1f} s newer than the first IMU sample (the clock was set back, or the data are "
+                      "played again): starts without it")  # fmt: skip
+            return
+        if age_s > bridge_s:
             self._say(f"the snapshot is {age_s:.1f} s old, more than the {bridge_s:g} s (max_bridge_s) that "
                       "can be bridged: starts without it")  # fmt: skip
             return

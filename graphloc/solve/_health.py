@@ -22,8 +22,7 @@ from graphloc.solve._decide import AGREES, CREDIBLE, Verdict, far_sigmas
 from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE
 from graphloc.trajectory import Trajectory, bounds_95
 
-# Health: DNV asks for 2.5 m at 95 % in port (Digerud); beyond 25 m a pose helps nobody there.
-_GOOD_BOUND_M, _LOST_BOUND_M, _LOST_HEADING_DEG = 2.5, 25.0, 45.0
+_LOST_BOUND_M, _LOST_HEADING_DEG = 25.0, 45.0  # beyond them a pose helps nobody in a harbour
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
 
 FAR_OFF = 3.0
@@ -132,22 +131,24 @@ def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:
 
 
 def health_over_time(
-    trajectory: Trajectory, since: dict[str, Array], misfits: Sequence[str]
+    trajectory: Trajectory, since: dict[str, Array], misfits: Sequence[str], good_bound_m: float
 ) -> tuple[tuple[Health, ...], tuple[HealthReason, ...]]:
     assert trajectory.cov is not None
     away = {name: _or_until(s, trajectory.stamps_ns) for name, s in since.items()}
     found = [
-        health_of(cov, {name: float(s[k]) for name, s in away.items()}, misfits[k])
+        health_of(cov, {name: float(s[k]) for name, s in away.items()}, good_bound_m, misfits[k])
         for k, cov in enumerate(trajectory.cov)
     ]
     return tuple(health for health, _ in found), tuple(why for _, why in found)
 
 
-def health_of(cov: Array, away_s: Mapping[str, float], misfit: str = "") -> tuple[Health, HealthReason]:
+def health_of(
+    cov: Array, away_s: Mapping[str, float], good_bound_m: float, misfit: str = ""
+) -> tuple[Health, HealthReason]:
     """Return how far a pose can be trusted, and why not fully.
 
     Args:
-        cov: (6, 6) as in `Trajectory`. away_s: s to where each absolute sensor agrees.
+        cov: (6, 6) as in `Trajectory`. away_s: s to where each absolute sensor agrees. good_bound_m: `output.good_bound_m`.
         misfit: what else speaks against it.
     """
     bound_m, _, heading_deg = (float(v) for v in bounds_95(cov[None])[0])
@@ -156,7 +157,7 @@ def health_of(cov: Array, away_s: Mapping[str, float], misfit: str = "") -> tupl
         return Health.LOST, HealthReason(f"95 % bound {bound_m:.0f} m, heading {heading_deg:.0f} deg", Cause.BOUND)
     if min(away_s.values(), default=np.inf) > _DEAD_RECKONING_S:
         return Health.DEAD_RECKONING, HealthReason("no absolute position agrees", Cause.NO_POSITION)
-    if bound_m > _GOOD_BOUND_M:
+    if bound_m > good_bound_m:
         return Health.DEGRADED, HealthReason(f"95 % bound {bound_m:.1f} m", Cause.BOUND)
     if silent:
         return Health.DEGRADED, HealthReason(

@@ -62,7 +62,12 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     since = {s.name: since_agreed(problem, s, result.verdicts) for s in problem.streams if s.row.absolute}
     stats = stats_of(problem, result)
     stats = replace(stats, warnings=(*stats.warnings, *unsaid), events=mount_event(result.problem))
-    health, reasons = health_over_time(trajectory, of_receivers(since, problem.config), misfits(problem, result, stats))
+    health, reasons = health_over_time(
+        trajectory,
+        of_receivers(since, problem.config),
+        misfits(problem, result, stats),
+        problem.config.output.good_bound_m,
+    )
     ledger = ledger_of(problem, recording, result.verdicts)
     corrected = {s.name: corrections(solved_constants(s, result.values), s.mount) for s in problem.streams}
     return Solution(
