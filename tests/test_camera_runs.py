@@ -315,7 +315,7 @@ def test_another_rig_sees_with_its_own_eyes(
     vessel = YAML(typ="safe").load((tmp_path / "out/vessel.yaml").read_text())
     assert vessel["sensors"]["imu"]["mount"]["rpy_deg"] == [180.0, 0.0, 0.0]
     matcher = vessel["sensors"]["aerial"]
-    assert (matcher["kind"], matcher["enabled"], matcher["image"]) == ("aerial", True, "aerial.tif")
+    assert (matcher["kind"], matcher.get("enabled", True), matcher["image"]) == ("aerial", True, "aerial.tif")
     assert matcher["lidars"]["mast"]["topic"] == "/mast/points"
 
 

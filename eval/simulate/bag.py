@@ -89,7 +89,7 @@ def _write(run: SimulatedRun, folder: Path, ros: int, storage: str, progress: Pr
     if run.harbour is not None:
         config = config.model_copy(update={"output": config.output.model_copy(update={"map_image": _AERIAL})})
     with (folder / _CONFIG).open("w", encoding="utf-8") as stream:
-        YAML(typ="safe", pure=True).dump(effective(config), stream)
+        YAML(typ="safe", pure=True).dump(effective(config, defaults=False), stream)
     _beside(run, folder)
     make = Messages(ros)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3

@@ -77,8 +77,11 @@ def with_changes(raw: Mapping[str, Any], changes: Mapping[str, object], where: s
     return tree
 
 
-def effective(config: VesselConfig) -> dict[str, Any]:
-    """Return the whole configuration, defaults included, as plain data for `run.json` and YAML."""
-    tree = config.model_dump(mode="json")
-    tree["sensors"] = {name: sensor.model_dump(mode="json") for name, sensor in config.sensors.items()}
+def effective(config: VesselConfig, *, defaults: bool = True) -> dict[str, Any]:
+    """Return the whole configuration as plain data for `run.json` and YAML; `defaults`: keys that have their default included."""
+    tree = config.model_dump(mode="json", exclude_defaults=not defaults)
+    tree["sensors"] = {
+        name: {"kind": sensor.kind, **sensor.model_dump(mode="json", exclude_defaults=not defaults)}
+        for name, sensor in config.sensors.items()
+    }
     return tree
