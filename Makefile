@@ -28,7 +28,7 @@ system-libraries:
 			"(Debian names) $(LIBRARIES)"
 
 demo: $(STAMP)
-	@$(BIN)/graphloc demo
+	@$(BIN)/graphloc demo --overwrite
 
 test: $(STAMP)
 	@$(BIN)/python -m pytest

@@ -404,7 +404,7 @@ def _all_elsewhere(sensor: str, camera: str, moved_m: Array) -> str:
     )
     return (
         f"{sensor}: camera {camera}: its tags all put the vessel {moved_m[0]:.1f} m east, {moved_m[1]:.1f} m north, "
-        f"{moved_m[2]:.1f} m above of where the rest has her: {why}"
+        f"{moved_m[2]:.1f} m above the place that the other sensors give: {why}"
     )
 
 
@@ -428,7 +428,7 @@ def _estimated_mounts(sightings: list[TagSighting], solution: Solution) -> Itera
 def _looks_elsewhere(sensor: str, camera: str, off_deg: float, mount: Rotation) -> str:
     rpy = ", ".join(f"{a:.0f}" for a in mount.as_euler("xyz", degrees=True))
     return (
-        f"{sensor}: camera {camera}: by its tags it looks {off_deg:.0f} deg elsewhere than its mount says: rpy_deg "
+        f"{sensor}: camera {camera}: by its tags its viewing direction is {off_deg:.0f} deg off its mount: rpy_deg "
         f"[{rpy}] would do (of the optical frame: x right, y down, z forward)"
     )
 

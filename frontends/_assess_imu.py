@@ -82,7 +82,7 @@ def mount_guess(
         turned = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], *body_axes, motions)
         if turned is not None and turned.astray:
             if abs(abs(turned.yaw_deg) - 90.0) < _QUARTER_DEG and turned.coherence > _OVERRULES:
-                said = f"not as in tf, since {turned.said}: right there only of a craft that goes sideways throughout"
+                said = f"not as in tf, since {turned.said}: tf is right only if the craft goes sideways throughout"
                 return replace(_turned(imu, accel, gyro, motions, pose[1], said), xyz_m=vec(pose[0]))
             note = f"; but {turned.said}: check it"
     rpy = vec(np.degrees(rpy_from_rotation(pose[1])))
@@ -111,7 +111,7 @@ def _measured_mount(imu: TopicData, accel: Array, gyro: Array, motions: Sequence
     mount = _turned(imu, accel, gyro, motions, level, f"{said}, {off_deg:.0f} deg off")
     turn = Rotation.from_euler("xyz", mount.rpy_deg, degrees=True).as_matrix() @ level.T
     roll, pitch, yaw = np.degrees(rpy_from_rotation(turn @ _level(axis))).tolist()
-    square = f"drafted square: where the sensor sits askew, and not the craft, set [{roll:.1f}, {pitch:.1f}, {yaw:.1f}]"
+    square = f"drafted in steps of 90 deg: if the sensor is tilted in the craft, rather than the craft itself, set [{roll:.1f}, {pitch:.1f}, {yaw:.1f}]"
     return replace(mount, evidence=f"{mount.evidence}; {square}")
 
 

@@ -218,9 +218,9 @@ def odometry_report(
         reverse = _astern(rows[:, 7])
         why = f"{why}; {_REVERSED}" if reverse else why
         if axes not in (None, BODY_AXES, EITHER):
-            role, why = "pose", f"its speeds are none along the craft: {fit}"
+            role, why = "pose", f"its speeds are not along the craft: {fit}"
     if not world.pose and role != "check_speed":
-        role, why = "other", "no pose about a datum that the vessel could have"
+        role, why = "other", "not a pose about a datum that the vessel could have"
     return OdometryReport(
         topic=stream.topic,
         msgtype=stream.msgtype,
@@ -245,7 +245,7 @@ def _fused(topic: str, world: World) -> str:
     if world.grid or world.centred or world.ned or world.origin is not None:
         known = {"a map grid": world.grid, "earth-centred": world.centred, "north, east, down": world.ned}
         frame = next((frame for frame, is_it in known.items() if is_it), "east-north-up about the fixes")
-        return f"an INS's or a filter's output, as its frame is {frame}, which no wheels know"
+        return f"an INS's or a filter's output, as its frame is {frame}, which wheel odometry cannot know"
     return ""
 
 

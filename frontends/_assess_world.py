@@ -104,7 +104,8 @@ def world_of(
     place = Datum(Geodetic(*first_fix)).geodetic_from_enu(offset[None, :])[0]
     lever = "" if antenna_m is not None else " and the antenna's unknown lever arm"
     return World(
-        vec(place), f"fits the fixes to {apart:.1f} m; their slow error{lever} is in it, and in every latitude"
+        vec(place),
+        f"fits the fixes to {apart:.1f} m; the origin inherits their drift{lever}, and so does every latitude and longitude written out",
     )
 
 

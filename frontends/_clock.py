@@ -371,7 +371,7 @@ def refuse_woven(
             raise InputError(
                 f"{after}: {topic} goes back by {back_s:.1f} s there, to {utc_text(int(stamps[k]))}, into times that {before} has "
                 "too, by the stamps and by the recording times: a clock was set back between them, and as one run they "
-                "would be laid over each other; give them one at a time"
+                "would be interleaved; give them one at a time"
             )
 
 
@@ -395,7 +395,7 @@ def refuse_set_back(topic: str, file: str, logs_ns: Stamps) -> None:
         raise InputError(
             f"{file}: {topic} goes back by {back_s:.1f} s within the file, from {utc_text(int(logs_ns[k - 1]))} to "
             f"{utc_text(int(logs_ns[k]))}, by the recording times: the recorder's clock was set back, and what was recorded "
-            "before and after it would be laid over each other; take a part of the bag before the latter time or after the "
+            "before and after it would be interleaved; take a part of the bag before the latter time or after the "
             "former (--start, --duration)"
         )
 

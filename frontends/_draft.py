@@ -48,8 +48,8 @@ _ANTENNA_OFF_M = 1.0  # from the IMU: of a car; 4 m on a boat or 0.3 m on a robo
 _RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off: else a wrong fix draws the track along
 # For how long the error of a float or single fix stays the same: from where RTK was, its growth is the bound.
 _FLOAT_S = 60.0
-_FILTERED = "by its name, or its messages, a filter's output: the IMU is in it already, and its error is slow, so that it is believed too much"
-_INS = "it tells its speed, as an INS or a filter does: the IMU is in it already, and its error is slow, so that it is believed too much"
+_FILTERED = "by its name, or its messages, a filter's output: it has used the IMU already, and its errors are correlated, so it gets too much weight"
+_INS = "it tells its speed, as an INS or a filter does: it has used the IMU already, and its errors are correlated, so it gets too much weight"
 _MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; drivers may publish each packet
 _TURN_S = 0.1
 _MOST_PARTS = 100  # of a submap
@@ -102,7 +102,7 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
     wheels = [o for o in speeds if not o.fused]
     for item in (o for o in speeds if o.fused):
         yield [
-            f"# {item.topic}: not fused, as receiver and IMU are in it already; truth_topic if it is better than they are; {item.why}"
+            f"# {item.topic}: not fused, as it has used receiver and IMU already; truth_topic if it is better than they are; {item.why}"
         ]
     yield from (_wheels_block(_numbered("wheels", k), item) for k, item in enumerate(wheels))
     for k, item in enumerate(o for o in inspection.odometry if o.role == "pose"):
@@ -321,7 +321,7 @@ def _other_block(name: str, gnss: GnssReport, others: PartOfFixes, *, enabled: b
         *_antenna_lines(gnss.tf_frame, "from tf", gnss.keeps_m),
         *_scatter_lines(own),
         *([_wandering(gnss)] if wanders else []),
-        f"  slow_error: {{{keys}}}  # guess: as large as floats claim, metres of what is none, and other from minute to minute",
+        f"  slow_error: {{{keys}}}  # guess: as large as float fixes claim, metres for other fixes; it changes from minute to minute",
     ]
 
 
@@ -395,7 +395,7 @@ def _as_large(gnss: GnssReport) -> tuple[float, str]:
         return gnss.apart_m, f"; so far it and {gnss.apart_from} wander against each other"
     if slow_m <= SlowErrorConfig().horizontal_sigma_m:
         return SlowErrorConfig().horizontal_sigma_m, ""
-    said = f"; scatter from fix to fix is {white_m:.1f} m, so that most of what they claim to be off is slow"
+    said = f"; scatter from fix to fix is {white_m:.1f} m, so most of the error that they claim is slow"
     return slow_m, said
 
 
@@ -577,7 +577,7 @@ def _error_lines(compass: CompassReport) -> list[str]:
 def _mount_lines(compass: CompassReport) -> list[str]:
     """By how much the course says that a compass is turned in the craft, and how well a course tells it."""
     if compass.offset_deg is None:
-        said = "no course tells; declination, or a mount, may be in it; 1 for a true heading whose mount is known"
+        said = "no GNSS course to compare with: declination or a mount angle may be included; 1 for a true heading whose mount is known"
         return [f"  mount_offset_sigma_deg: {_UNKNOWN_DEG:.1f}  # guess: {said}"]
     lines = []
     sigma, why = abs(compass.offset_deg), "as far as it is off the GNSS course"
@@ -587,7 +587,7 @@ def _mount_lines(compass: CompassReport) -> list[str]:
         # Of a vessel that is set sideways by turns, the mean course is no better than that.
         askew = round(compass.offset_deg), max(_LEEWAY_DEG, compass.scatter_deg or 0.0)
         yaw, sigma = (quarter, rest) if rest < 15.0 else askew
-        why = "a course is no heading, and tells no more"
+        why = "the course differs from the heading by leeway, so it shows no more than that"
         astern = ", unless the vessel goes astern most of the time: then 0" if compass.backwards else ""
         lines.append(
             f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course{astern}"

@@ -34,7 +34,7 @@ _FEWEST_STAMPS = 10  # that tell of a clock
 _STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma: a receiver's stamps; recording times instead of these
 # Fixes by NMEA are stamped as much after the times that they tell; those of whole seconds by anything up to a second.
 _LEAST_AFTER_S, _MOST_AFTER_S, _EVEN_S = 0.1, 1.0, 0.5
-_STAMPS = "stamped when measured, or later? estimated with the run; 0 where a receiver's clock stamps"
+_STAMPS = "stamps may be late: the delay is estimated with the run; set 0 where the receiver stamps with its own clock"
 _ESTIMATED = ("gnss", "gnss_velocity")  # whose delay is, with the run
 _SET = ("imu", "gnss", "gnss_velocity", "body_velocity", "compass")  # whose clocks are set; poses may take their time
 
@@ -63,7 +63,7 @@ def _stamp_lines(kind: str, own: TopicReport) -> list[str]:
     if not own.recorded:
         return []
     unknown = "" if kind in _ESTIMATED else ", which no bound includes"
-    said = f"guess: its headers hold no stamps, or whole seconds only; recording times are late by as long as a message takes{unknown}"
+    said = f"guess: its headers hold no stamps, or whole seconds only; recording times are late by the transport delay of a message{unknown}"
     return [f"  stamps: recorded  # {said}"]
 
 
@@ -76,7 +76,7 @@ def _drift_lines(own: TopicReport) -> list[str]:
     said = (
         f"it {'gains' if ppm > 0.0 else 'loses'} {abs(gained_s):.2f} s on the steadiest clock, by the recording times"
     )
-    said += "" if ppm > 0.0 else "; 0 if its messages only took ever longer to come"
+    said += "" if ppm > 0.0 else "; set 0 if the clock is right, and only the transport delay of its messages grew"
     return [f"  clock_drift_ppm: {ppm:.1f}  # guess: {said}"]
 
 
@@ -98,8 +98,8 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
     if abs(behind) > EPOCH_LIMIT_S:
         offset_s, sigma_s = offset_s + behind, _ON_ITS_WAY_S
         why.append(
-            f"its clock is {'behind' if behind > 0 else 'ahead of'} {clock}, by the recording times; how much longer one "
-            f"message takes than the other is in it{'' if kind in _ESTIMATED else ', which no bound includes'}"
+            f"its clock is {'behind' if behind > 0 else 'ahead of'} {clock}, by the recording times; that includes the "
+            f"difference of their transport delays{'' if kind in _ESTIMATED else ', which no bound includes'}"
         )
     if late is not None:
         offset_s, sigma_s = offset_s + late[0], max(late[1], _STAMPED_LATE_S)
@@ -118,7 +118,9 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
     lines = [f"  time_offset_s: {offset_s:.3f}  # guess: {'; '.join(why)}"] if why else []
     fixes_late_s = next((r.late_s[0] for r in inspection.gnss if r.late_s), 0.0)
     if kind == "gnss_velocity" and late is not None and late[0] < fixes_late_s - MOST_ON_ITS_WAY_S:
-        lines.append(f"  min_sigma_mps: {_FILTERED_SIGMA_MPS}  # guess: so late, it is filtered, and its error lasts")
+        lines.append(
+            f"  min_sigma_mps: {_FILTERED_SIGMA_MPS}  # guess: so late, it is filtered, and its errors are correlated"
+        )
     if kind in _ESTIMATED:
         hinted = next((r.hinted_s for r in inspection.gnss if r.topic.partition(" ")[0] == topic and r.hinted_s), None)
         said = (
@@ -192,12 +194,12 @@ def scan_clock_lines(inspection: Inspection, lidars: tuple[MountedTopic, ...]) -
     if -MOST_ON_ITS_WAY_S <= ahead_s <= SCANS_AHEAD_S:
         return []
     way = "ahead of" if ahead_s > 0.0 else "behind"
-    said = f"by the recording times their clock is {way} the IMU's by {abs(ahead_s):.2f} s, how much longer their scans take aside"
+    said = f"by the recording times their clock is {way} the IMU's by {abs(ahead_s):.2f} s, the difference of their transport delays included"
     if abs(ahead_s) <= EPOCH_LIMIT_S:
         return [f"  stamp_sigma_s: {abs(ahead_s):.2f}  # guess: {said}; estimated with the run"]
     return [
         f"  time_offset_s: {-ahead_s:.3f}  # guess: {said}",
-        f"  stamp_sigma_s: {_ON_ITS_WAY_S:.2f}  # guess: that, estimated with the run",
+        f"  stamp_sigma_s: {_ON_ITS_WAY_S:.2f}  # guess: that difference, estimated with the run",
     ]
 
 
@@ -214,5 +216,7 @@ def recorded_lines(inspection: Inspection, mounted: tuple[MountedTopic, ...]) ->
             clock = (
                 "have no stamps" if item.latency_s is None else f"are stamped {item.latency_s:+.0f} s before they come"
             )
-            return [f"  stamps: recorded  # guess: messages of {item.topic} {clock}; late by as long as one takes"]
+            return [
+                f"  stamps: recorded  # guess: messages of {item.topic} {clock}; recording times are late by the transport delay"
+            ]
     return []

@@ -111,7 +111,7 @@ def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
         apart_s = float(np.median(steps_s[steps_s >= _AT_ONCE * steps_s.mean()]))
         if apart_s < _BURST_S:
             return []
-        said = f"{sensor}: its measurements are stamped in bursts, {apart_s:.1f} s apart: when they came, not when they were of"
+        said = f"{sensor}: its measurements are stamped in bursts, {apart_s:.1f} s apart: with their time of arrival, not of measurement"
         return [f"{said}; times are off by up to that, positions by that times the speed, which no bound includes"]
     if len(moments) < 3 or 1.0 - len(moments) / len(stamps_ns) < _CUT:
         return []

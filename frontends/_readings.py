@@ -187,7 +187,7 @@ def clock_warnings(sensors: Sequence[Readings]) -> tuple[list[str], tuple[str, .
             lines.append(
                 f"{r.sensor}: its clock is {abs(behind):.3f} s {'behind' if behind > 0 else 'ahead of'} that of "
                 f"{reference.sensor}, by the recording times; if that is right, set its time_offset_s to {now_s + behind:.3f}"
-                f"{f' instead of {now_s:g}' if now_s else ''} (how much longer its messages take than those of the other is in it)"
+                f"{f' instead of {now_s:g}' if now_s else ''} (that includes the difference of their transport delays)"
             )
         if abs(gain_s) > _clock.GAIN_LIMIT_S:
             cure = "synchronise the clocks, or smooth short parts (--start, --duration)"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements that come faster than their sensor errs anew: they cost time and memory, and tell nothing new."""
+"""Measurements that come faster than their errors decorrelate: they cost time and memory, and add no information."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from graphloc.time import NS_PER_S
 
 LEAST_APART_NS = 45_000_000
 """Between two fixes, velocities or headings of a fast sensor that are used: 20 a second stay, though steps between their stamps are up to 5 ms short."""
-THINNED = "less than 0.05 s after the one before: what it errs lasts longer, so that it tells nothing new"
+THINNED = f"less than {LEAST_APART_NS / 1e6:.0f} ms after the one before: its error is correlated for longer than this, so it adds no information"
 _RATE_OVER_NS = 2 * NS_PER_S
 
 

@@ -201,7 +201,7 @@ def test_calibration_names_it_all_the_same_and_that_the_track_has_it() -> None:
     lines = {s.key: s for s in found.suggestions}
     line, configured = lines["sensors.gnss.mount.xyz_m[0]"], displaced(1.0).config.sensors["gnss"].mount.xyz_m[0]
     assert line.suggested - configured == pytest.approx(0.9, abs=0.3)
-    assert line.action.startswith("the track has it in it already, by mount_sigma_m")
+    assert line.action.startswith("already corrected in the track, by mount_sigma_m")
 
 
 def test_a_place_far_beyond_its_sigma_is_said() -> None:

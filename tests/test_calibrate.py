@@ -388,9 +388,9 @@ def test_of_a_delay_that_the_track_has_in_part_the_rest_is_asked_for(right: app.
     gnss = right.config.sensors["gnss"].model_copy(update={"stamp_sigma_s": 0.05})
     config, off = right.config.with_sensors({"gnss": gnss}), OffsetEstimate(value=-0.4, sigma=0.05, drop=64.0)
     for taken_s, action in (
-        (-0.38, "the track has it in it already, by stamp_sigma_s"),
-        (None, "the track has it in it already, by stamp_sigma_s"),
-        (-0.2, "the track has -0.2 s of it in it, by stamp_sigma_s; measure it, then set it"),
+        (-0.38, "already corrected in the track, by stamp_sigma_s"),
+        (None, "already corrected in the track, by stamp_sigma_s"),
+        (-0.2, "the track has -0.2 s of it corrected already, by stamp_sigma_s; measure it, then set it"),
     ):
         assert _suggestion(("gnss", "time"), off, {}, right.recording, config, taken_s).action == action
 

@@ -255,9 +255,24 @@ def test_the_written_bag_holds_the_track(
     np.testing.assert_allclose(east, table["east_m"], atol=1e-3)
 
 
+@pytest.mark.parametrize(("folder", "holds"), [("demo", "run.json"), ("demo-bag", "truth.json")])
+def test_demo_replaces_no_folder_unasked(
+    folder: str, holds: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It did so, also with the run of another bag at --out."""
+    (tmp_path / folder).mkdir()
+    (tmp_path / folder / holds).write_text("mine")
+    assert called(monkeypatch, "demo", "-o", tmp_path / "demo") == 2
+    assert f"{folder}: exists already; give --overwrite" in capsys.readouterr().err
+    assert (tmp_path / folder / holds).read_text() == "mine"
+
+
 def test_sensors_and_config_are_listed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert called(monkeypatch, "sensors") == 0
-    assert {"imu", "gnss", "compass", "pose"} <= {line.split()[0] for line in capsys.readouterr().out.splitlines()}
+    listed = capsys.readouterr().out
+    assert {"imu", "gnss", "compass", "pose"} <= {line.split()[0] for line in listed.splitlines()}
+    assert "makers' messages" in listed
+    assert not set("[]`") & set(listed)  # links and code of docs/configuration.md
     assert called(monkeypatch, "config", "--docs") == 0
     written = (Path(__file__).parent.parent / "docs/configuration.md").read_text()
     assert capsys.readouterr().out == written, (

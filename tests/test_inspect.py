@@ -455,7 +455,7 @@ def test_a_velocity_is_judged_without_the_noise_of_the_fixes(scatter_m: float, a
 
 @pytest.mark.parametrize("jump_m", [0.0, 15.0])
 def test_a_jump_of_the_fixes_hides_no_wheels(jump_m: float) -> None:
-    """15 m for 20 s: two chords of 7 m/s, beside 1 m/s, and wheels were taken for a pose whose 'speeds are none along the craft'."""
+    """15 m for 20 s: two chords of 7 m/s, beside 1 m/s, and wheels were taken for a pose whose 'speeds are not along the craft'."""
     t, yaw = np.arange(300.0), 0.05 * np.arange(300.0)
     way = np.cumsum(np.column_stack([np.cos(yaw), np.sin(yaw), 0.0 * t]), axis=0)
     way[(t >= 100.0) & (t < 120.0), :2] += jump_m * np.array([0.6, 0.8])
@@ -899,7 +899,9 @@ def test_an_ins_that_tells_its_speed_is_no_wheels(frame: str, tmp_path: Path) ->
     found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
     (item,) = found.odometry
     assert item.fused
-    assert f"its frame is {'a map grid' if frame == 'map grid' else frame}, which no wheels know" in item.why
+    assert (
+        f"its frame is {'a map grid' if frame == 'map grid' else frame}, which wheel odometry cannot know" in item.why
+    )
     assert "wheels" not in config.sensors
     if frame == "map grid":
         assert "as an INS or a filter does" in text

@@ -582,7 +582,7 @@ def test_what_fixes_claim_and_do_not_scatter_by_is_slow(
     receiver = config.sensors["gnss"]
     assert isinstance(receiver, GnssConfig)
     assert receiver.slow_error.horizontal_sigma_m == pytest.approx(slow_m)
-    assert ("most of what they claim to be off is slow" in text) == (slow_m > 2.0)
+    assert ("most of the error that they claim is slow" in text) == (slow_m > 2.0)
 
 
 @pytest.mark.parametrize("silent", ["/fix", "/cheap/fix"])

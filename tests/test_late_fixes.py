@@ -136,7 +136,7 @@ def test_calibration_names_it_all_the_same_and_that_the_track_has_it() -> None:
     assert found is not None
     (line,) = (s for s in found.suggestions if s.key == "sensors.gnss.time_offset_s")
     assert line.suggested == pytest.approx(-LATE_S, abs=0.03)
-    assert line.action == "the track has it in it already, by stamp_sigma_s"
+    assert line.action == "already corrected in the track, by stamp_sigma_s"
 
 
 @pytest.mark.parametrize("mode", ["offline", "online"])

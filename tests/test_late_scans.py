@@ -138,7 +138,7 @@ def test_calibration_shows_what_the_track_has_taken() -> None:
     assert taken_s == pytest.approx(-0.15, abs=0.03)
     (line,) = (s for s in found.calibration.suggestions if s.key == f"sensors.{name}.time_offset_s")
     assert line.suggested == pytest.approx(-0.15, abs=0.03)
-    assert line.action == "the track has it in it already, by stamp_sigma_s"
+    assert line.action == "already corrected in the track, by stamp_sigma_s"
 
 
 @pytest.mark.parametrize(("taken_s", "with_care"), [(-0.15, False), (-0.05, True), (None, False)])

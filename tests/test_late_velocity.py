@@ -227,7 +227,7 @@ def test_the_track_and_the_calibration_say_how_late() -> None:
     assert found is not None
     (line,) = (s for s in found.suggestions if s.key == "sensors.velocity.time_offset_s")
     assert line.suggested == pytest.approx(-LATE_S, abs=0.04)
-    assert line.action == "the track has it in it already, by stamp_sigma_s"
+    assert line.action == "already corrected in the track, by stamp_sigma_s"
 
 
 def test_the_first_screen_says_that_the_heading_is_off() -> None:

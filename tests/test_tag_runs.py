@@ -363,7 +363,7 @@ def test_tags_that_face_the_other_way_in_the_survey_are_named() -> None:
 
     said = dock(tag=turned, lasts_s=20.0, rate_hz=1.0, route_s=30.0).said
     assert "tag 226, tag 227, tag 228: by the fixes they are seen from behind" in said
-    assert "elsewhere than its mount says" not in said
+    assert "off its mount:" not in said
 
 
 def test_tags_whose_faces_are_given_in_another_convention_are_named() -> None:
@@ -379,7 +379,7 @@ def test_tags_whose_faces_are_given_in_another_convention_are_named() -> None:
     for line in lines:
         right, told = (float(part.split()[-1]) for part in line.split(" would do")[0].split(" instead of "))
         assert (told - right) % 360.0 == pytest.approx(90.0, abs=5.0)
-    assert "elsewhere than its mount says" not in said
+    assert "off its mount:" not in said
 
 
 def test_tags_whose_faces_are_all_a_little_off_are_named_beside_the_mount() -> None:
@@ -390,7 +390,7 @@ def test_tags_whose_faces_are_all_a_little_off_are_named_beside_the_mount() -> N
         return tag.model_copy(update={"rpy_deg": None, "facing_deg": heading - 20.0})
 
     said = dock(tag=turned, lasts_s=20.0, rate_hz=1.0, route_s=30.0).said
-    (line,) = (line for line in said.splitlines() if "elsewhere than its mount says" in line)
+    (line,) = (line for line in said.splitlines() if "off its mount:" in line)
     other = line.split("they all face ")[1]
     assert float(other.split()[0]) == pytest.approx(20.0, abs=3.0)
     assert " clockwise than the survey says" in other
@@ -450,7 +450,7 @@ def test_tags_that_hang_upside_down_are_named(hanging: tuple[int, ...]) -> None:
     (line,) = [line for line in said.splitlines() if "upside down" in line]
     assert line.startswith(f"tags: {', '.join(f'tag {number}' for number in hanging)}: upside down")
     assert "rpy_deg: [-90, 0, -F]" in line
-    assert "elsewhere than its mount says" not in said
+    assert "off its mount:" not in said
 
 
 def test_a_survey_of_heights_above_the_geoid_is_named() -> None:
@@ -462,7 +462,7 @@ def test_a_survey_of_heights_above_the_geoid_is_named() -> None:
     assert "heights above the geoid" in line
     up_m = float(line.split(" m above")[0].split()[-1])
     assert up_m == pytest.approx(-25.0, abs=2.0)
-    assert "elsewhere than its mount says" not in said
+    assert "off its mount:" not in said
 
 
 def test_one_tag_of_another_size_is_named() -> None:

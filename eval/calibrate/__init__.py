@@ -157,11 +157,13 @@ def _action(
         and isinstance(block, GnssConfig | VelocityConfig | AerialConfig)
         and block.stamp_sigma_s > 0.0
     ):
-        action = "the track has it in it already, by stamp_sigma_s"
+        action = "already corrected in the track, by stamp_sigma_s"
         if taken_s is not None and abs(found.value - taken_s) > _MUCH_LESS * abs(found.value):
-            action = f"the track has {taken_s:+.2g} s of it in it, by stamp_sigma_s; measure it, then set it"
+            action = (
+                f"the track has {taken_s:+.2g} s of it corrected already, by stamp_sigma_s; measure it, then set it"
+            )
     if name[1] in _AXIS and isinstance(block, GnssConfig | VelocityConfig) and block.mount_sigma_m > 0.0:
-        action = "the track has it in it already, by mount_sigma_m; measure it, then set it and mount_sigma_m: 0"
+        action = "already corrected in the track, by mount_sigma_m; measure it, then set it and mount_sigma_m: 0"
     if name[1] in _AXIS and (shares := _of_one_antenna(name[0], recording, config)):
         action += f", also of {', '.join(shares)}, taken for the same antenna"
     if name[1] == "time" and (same := _of_one_clock(name[0], config)):

@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+_MARKDOWN = re.compile(r"\[([^]]+)\]\([^)]+\)|`([^`]+)`")  # links and code: docs/configuration.md has the same texts
 
 
 def sensors() -> None:
@@ -15,7 +18,8 @@ def sensors() -> None:
     from graphloc.factors import KINDS
 
     for kind, config in KINDS.items():
-        typer.echo(f"{kind:15} {(config.__doc__ or '').splitlines()[0]}")
+        said = _MARKDOWN.sub(r"\1\2", (config.__doc__ or "").splitlines()[0])
+        typer.echo(f"{kind:15} {said}")
 
 
 def show_config(

@@ -63,12 +63,18 @@ def simulate(
 def demo(
     out: OutOption = Path("runs/demo"),
     seed: SeedOption = 0,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Simulate a harbour run with drifting GNSS and 40 % false matches, smooth its bag, and compare."""
+    from graphloc import outputs
     from graphloc.eval.simulate import harbour_scenarios
     from graphloc.eval.simulate import simulate as run_simulation
-    from graphloc.eval.simulate.bag import write_bag
+    from graphloc.eval.simulate.bag import TRUTH, write_bag
+    from graphloc.folders import check_folder
 
+    simulated = out.parent / f"{out.name}-bag"
+    check_folder(out, overwrite=overwrite, mark=outputs.MARK)
+    check_folder(simulated, overwrite=overwrite, mark=TRUTH)
     run = run_simulation(replace(harbour_scenarios()["bl1-drift"], lidar_hz=0.0), seed)  # its matches are made up
-    bag, config = write_bag(run, out.parent / f"{out.name}-bag", ros=2, overwrite=True, progress=progress())
-    smooth_bags(RunOptions(bag=[bag], config=config, out=out, overwrite=True), compare=True)
+    bag, config = write_bag(run, simulated, ros=2, overwrite=overwrite, progress=progress())
+    smooth_bags(RunOptions(bag=[bag], config=config, out=out, overwrite=overwrite), compare=True)

@@ -114,8 +114,8 @@ def ambiguity(sensor: str, aspect: str, probability: Array) -> list[str]:
     if (share := len(open_still) / len(probability)) < _LONG:
         return []
     typical = float(np.median(open_still))
-    said = f"{sensor}: what it shows of the {aspect} is ambiguous: with a probability of {typical:.0%} what is believed of it"
-    said += f" is false as a whole, for {share:.0%} of the run; the bounds include that"
+    said = f"{sensor}: the {aspect} that it gives is ambiguous: with a probability of {typical:.0%} its accepted"
+    said += f" measurements are wrong together, for {share:.0%} of the run; the bounds include that"
     return [Graded(said, f"{aspect} by {sensor}", typical)]
 
 

@@ -40,9 +40,11 @@ def slow_error_warning(sensor: str, left_out: SlowProcess | None) -> list[str]:
     if left_out is None or left_out.sigma[0] < _SMALL_M:
         return []
     included = (
-        f"the bounds include {left_out.sigma[0]:.2g} m (1 sigma) for it, slow_error.horizontal_sigma_m (RTK: 0.03)"
+        f"the bounds include {left_out.sigma[0]:.2g} m (1 sigma) for it: slow_error.horizontal_sigma_m (RTK: 0.03)"
     )
-    return [f"{sensor}: no second sensor can separate its slow error (multipath) from motion; {included}"]
+    return [
+        f"{sensor}: no second sensor measures position or velocity, so its drift (multipath) cannot be told from motion; {included}"
+    ]
 
 
 def disagreement_warning(sensor: str, weights: Array) -> list[str]:
@@ -71,7 +73,7 @@ def scale_warning(sensor: str, stated: SensorConfig, taken: SensorConfig) -> lis
     cure = ", ".join(
         [f"{key}: {getattr(taken, key):.2g}" for key in floors] + [f"{key}: {getattr(taken, key):.1f}" for key in times]
     )
-    said = f"{sensor}: its measurements scatter more than they state; taken with, and to be set unless its mount or stamps are wrong: {cure}"
+    said = f"{sensor}: its measurements scatter more than they state; this run takes the following, which is to be set unless its mount or stamps are wrong: {cure}"
     return [Graded(said, f"sigmas of {sensor}", max(times.values()))]
 
 
@@ -143,7 +145,7 @@ def _turned_mount(stream: Stream, result: BatchResult) -> list[str]:
     if stream.row.along_body:
         turned, checked = "its velocities are turned by", "its mount"
     said = (
-        f"{turned} {np.degrees(others):+.1f} deg against the other sensors' ({sigmas:.1f} sigmas of what mounts are allowed to be off by): "
+        f"{turned} {np.degrees(others):+.1f} deg against the other sensors' ({sigmas:.1f} sigmas of the configured mount errors): "
         f"check {checked} and theirs"
     )
     return [f"{stream.name}: {said}"]
@@ -168,7 +170,7 @@ def mount_warning(problem: Problem, error: MountError) -> list[str]:
         return []
     said = f"{problem.imu.sensor}: the other sensors turn its mount by {np.degrees(turn):+.1f} +- {np.degrees(error.sigma_rad):.1f} deg of yaw"
     kept = "" if problem.imu_turn_rad.any() else ", though it stays as configured"
-    said += f"{kept} ({sigmas:.1f} sigmas of what that may be): check its mount and theirs"
+    said += f"{kept} ({sigmas:.1f} sigmas of what mount_sigma_deg allows): check its mount and theirs"
     return [Graded(said, "mount of the IMU", sigmas)]
 
 
@@ -228,8 +230,8 @@ def _unaided_ends(problem: Problem) -> list[str]:
     begun_ns, over_ns = min(aided_ns), max(aided_ns)
     ends = [(begun_ns - first_ns, f"before {utc_text(begun_ns)}"), (last_ns - over_ns, f"after {utc_text(over_ns)}")]
     return [
-        f"for {silent_ns * 1e-9:.0f} s, {when}, nothing measures position or velocity: the IMU alone carries the track there, and to it a "
-        "steady speed feels like rest, so that it may be far off though the vessel lies still; leave that part out (--start, --duration)"
+        f"for {silent_ns * 1e-9:.0f} s, {when}, nothing measures position or velocity: the IMU alone carries the track there, and it cannot "
+        "tell a steady speed from rest, so the track may be far off though the vessel lies still; leave that part out (--start, --duration)"
         for silent_ns, when in ends
         if silent_ns > _UNAIDED_S * NS_PER_S
     ]
@@ -297,7 +299,7 @@ def _lasting_error(stream: Stream, verdicts: Sequence[Verdict]) -> list[str]:
         return []
     said = f"{stream.name}: its errors last for some {found.time_s:.0f} s, by its residuals, and count as independent"
     said += f": set slow_error: {{sigma_m: {found.sigma_m:.2g}, time_constant_s: {found.time_s:.0f}}}, or more; "
-    said += "if it has none such, what carries the track beside it (IMU, wheels) is believed too much"
+    said += "if its errors are independent, the noise of the sensors between its poses (IMU, wheels) is configured too small"
     return [Graded(said, f"errors of {stream.name} that last", found.sigma_m)]
 
 
