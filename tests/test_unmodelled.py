@@ -21,6 +21,7 @@ from graphloc.solution import Solution
 from graphloc.solve import _solution
 from graphloc.solve._batch import BatchResult
 from graphloc.solve._unmodelled import Unmodelled, unmodelled
+from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
 from tests.faults import arrivals_of, feed, finish
 from tests.slowly import with_few_states
@@ -28,10 +29,12 @@ from tests.slowly import with_few_states
 CORRELATED_S = 200.0  # of the default configuration
 
 
-def drifting(seed: int, sigma_m: float, compass_hz: float = 0.0) -> tuple[SimulatedRun, Recording, VesselConfig]:
+def drifting(
+    seed: int, sigma_m: float, compass_hz: float = 0.0, duration_s: float = 60.0
+) -> tuple[SimulatedRun, Recording, VesselConfig]:
     """A run of IMU, one receiver and a compass, if any, and its recording and configuration where the fixes drift as that states."""
     scenario = Scenario(
-        path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, compass_hz=compass_hz, imu_hz=50.0, gnss_hz=2.0,
+        path="loops", duration_s=duration_s, noise="clean", pose_hz=0.0, compass_hz=compass_hz, imu_hz=50.0, gnss_hz=2.0,
         gnss_sigma_m=0.05,
     )  # fmt: skip
     run = simulate(scenario, seed)
@@ -134,6 +137,26 @@ def test_online_too(monkeypatch: pytest.MonkeyPatch) -> None:
     heading, velocity = np.mean([h.mean() for h, _ in found]), np.mean([v.mean() for _, v in found])
     assert 0.3 < heading < 1.5
     assert 0.3 < velocity < 1.3
+
+
+def test_what_a_drift_did_to_the_velocity_is_in_the_bounds_of_a_place_without_fixes() -> None:
+    """Of the place only the size of the drift was, also half a minute later: mean squares of 2.8 and 3.9. Without the motion model the latter is 0.1."""
+    found = []
+    for seed in range(2):
+        run, recording, config = drifting(seed, 2.0, compass_hz=5.0, duration_s=90.0)
+        begin_ns = run.truth.stamps_ns[0]
+        kept = [m for m in recording.measurements if m.sensor != "gnss" or m.stamp_ns - begin_ns < 35 * NS_PER_S]
+        config = with_few_states(config)
+        track = app.replay_recording(replace(recording, measurements=tuple(kept)), config).solution.trajectory
+        assert track.cov is not None
+        since_s = (track.stamps_ns - begin_ns) / NS_PER_S - 35.0
+        inside = (track.stamps_ns <= run.truth.stamps_ns[-1]) & (since_s > 15.0)
+        off_m = (track.p_world_m[inside] - run.truth.at(track.stamps_ns[inside]).p_world_m)[:, :2]
+        squares_off = off_m**2 / np.diagonal(track.cov[inside], axis1=1, axis2=2)[:, :2]
+        found.append([squares_off[since_s[inside] < 30.0].mean(), squares_off[since_s[inside] > 40.0].mean()])
+    soon, later = np.mean(found, axis=0)
+    assert 0.1 < soon < 2.0
+    assert 0.3 < later < 2.0
 
 
 def with_compass() -> tuple[SimulatedRun, VesselConfig]:

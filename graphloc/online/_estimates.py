@@ -23,6 +23,7 @@ from graphloc.solve._covariances import (
     world_covariance,
 )
 from graphloc.solve._health import health_of, of_receivers
+from graphloc.time import NS_PER_S
 
 
 def estimate_of(
@@ -91,8 +92,8 @@ def _covariances(now: Propagated, lag: Lag, R: Array, unmodelled: UnmodelledErro
     """
     lever, streams = -lag.problem.t_body_imu_m, list(lag.problem.streams.values())
     cov, v_cov = world_covariance(sound(now.pose_cov), R, lever), now.velocity_cov
-    cov[:3, :3] += unmodelled_covariance(streams)
-    if unmodelled is not None:
-        cov += unmodelled.pose(R @ lever)
+    if unmodelled is not None:  # else there is nothing of that
+        ahead_s = (now.stamp_ns - unmodelled.newest.stamp_ns) / NS_PER_S
+        cov += unmodelled.pose(R @ lever, unmodelled_covariance(streams), ahead_s)
         v_cov = v_cov + unmodelled.velocity
     return cov, v_cov

@@ -139,7 +139,7 @@ class Lag:
         for name, stream in self.problem.streams.items():
             told[name] = self._entries.information(stream, self._followed.get(name, 0))
             self._followed[name] = len(stream.measurements)
-        unmodelled.advance(self.newest, self.problem.links, told)
+        unmodelled.advance(self.newest, self.problem.links, told, self.problem.motion_model)
 
     def unmodelled(self, begun: BeforeStart | None = None, last: ErrorSizes | None = None) -> UnmodelledError | None:
         """Return what left-out slow errors and the IMU's mount do to the newest state, as known from elsewhere (see `UnmodelledError.at`)."""

@@ -14,7 +14,7 @@ from graphloc import keys
 from graphloc.build import bias_step, closing_variance, nav_state, slow_begin, slow_end, slow_step
 from graphloc.errors import SolveError
 from graphloc.frames import Array
-from graphloc.graph import TIME_OFFSET, Attachment, Going, Residual
+from graphloc.graph import TIME_OFFSET, Attachment, Going, InertialLink, Residual
 from graphloc.motion_model import UNSURE_MPS, Moving
 from graphloc.online._anchor import Anchor, in_world, without_prior
 from graphloc.online._constants import Constants
@@ -23,6 +23,7 @@ from graphloc.online._window import Held, Window
 from graphloc.solve._health import FAR_OFF
 from graphloc.solve._prediction import Prediction, prediction_of
 from graphloc.solve._warnings import late_far_off
+from graphloc.time import NS_PER_S
 
 _HOLE_S = 1.0  # an IMU gap that the motion model is not applied across
 _AWAY_M = 2e3  # no vessel moves so far between two states, even across the longest IMU gap that is bridged
@@ -44,6 +45,16 @@ class Newest:
     bias: gtsam.imuBias.ConstantBias
     pose_cov: Array
     velocity_cov: Array
+
+    @property
+    def unsure(self) -> bool:
+        """Whether the horizontal velocity is so uncertain that the motion model is applied."""
+        return float(np.linalg.eigvalsh(self.velocity_cov[:2, :2])[-1]) >= UNSURE_MPS**2
+
+
+def hole_within(links: InertialLink, begin_ns: int, end_ns: int) -> bool:
+    """Return whether the IMU is silent for long in an interval: how the axes that the motion model is about turned is then unknown."""
+    return any(a < end_ns and b > begin_ns and b - a > _HOLE_S * NS_PER_S for a, b in links.gaps())
 
 
 def propagated_covariance(cov: Array, newest: Newest, R: Array, dt_s: float, noise: Array) -> Array:
@@ -163,14 +174,13 @@ class States:
     def _next_motion(self, j: int, dt_s: float) -> None:
         """Learn the motion model, or, where the velocity is uncertain, stage its factors from slow node j to now."""
         problem, newest, timeline = self._problem, self._newest, self._problem.timeline
-        if float(np.linalg.eigvalsh(newest.velocity_cov[:2, :2])[-1]) < UNSURE_MPS**2:
+        if not newest.unsure:
             problem.motion_model.learn(newest.stamp_ns, (newest.pose.rotation().matrix().T @ newest.velocity)[:2])
             return
         begin_ns, end_ns = timeline.slow_stamps_ns[j], timeline.stamps_ns[timeline.last]
         if begin_ns < timeline.stamps_ns[timeline.first]:
             return
-        # The rotation across an IMU gap is unknown, and so are the axes that the model is about.
-        if not any(a < end_ns and b > begin_ns and b - a > _HOLE_S * 1e9 for a, b in problem.links.gaps()):
+        if not hole_within(problem.links, begin_ns, end_ns):
             before, now = (Moving.of(self._window.values, k) for k in (timeline.floor(begin_ns), timeline.last))
             self._window.add(problem.motion_model.step(before, now, dt_s))
 

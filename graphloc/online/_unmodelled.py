@@ -2,7 +2,7 @@
 """What the slow errors that are left out of the window (`LiveStream.left_out`), and a mount of the IMU that is off, do to its newest state.
 
 Nothing tells such an error d from motion, so the estimate follows it: in position by all of it, in heading and velocity by as
-much as the IMU lets it. Its covariance is that of a consider parameter (Schmidt 1966) of the filter that the newest state is:
+much as the IMU lets it; once no fixes come, in position by what that velocity makes of it. Its covariance is that of a consider parameter (Schmidt 1966) of the filter that the newest state is:
 with F, Q from one state to the next, J the information of all measurements since and J_p that of the fixes on the position,
 
     P+ = ((F P F' + Q)^-1 + J)^-1,    e+ = (1 - P+ J) F e + P+ J_p d
@@ -13,8 +13,8 @@ the body; so that becomes (1 - P+ J) F (e + U m) + P+ J U+ m, which is linear in
 The state has the slow errors of the other sensors with it: a compass whose mount offset is unknown holds a heading for a while,
 but does not tell it. P is computed here, not taken from the window: that is linearised anew now and then, and judges older
 measurements again, which its covariances of two states do not tell from what was measured between them. Offline:
-`graphloc.solve._unmodelled`, `_imu_mount`, where m is estimated, too. Not handled: what comes late counts as measured at the newest state; the motion model
-(after 100 s without fixes the errors are up to 15 % larger for it).
+`graphloc.solve._unmodelled`, `_imu_mount`, where m is estimated, too. Where the window has the motion model (`graphloc.motion_model`),
+F and Q have it, without its kernel. Not handled: what comes late counts as measured at the newest state.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ import numpy as np
 from graphloc import keys
 from graphloc.frames import Array, skew
 from graphloc.graph import Going, InertialLink, SlowProcess
+from graphloc.motion_model import MotionModel
 from graphloc.online._anchor import in_world, sound
 from graphloc.online._live import LiveProblem, LiveStream
-from graphloc.online._states import Newest
+from graphloc.online._states import Newest, hole_within
 from graphloc.solve._unmodelled import Unmodelled
 from graphloc.time import NS_PER_S
 
@@ -126,7 +127,9 @@ class UnmodelledError:
         """Whether it must be brought up to a stamp: what a mount does changes slowly."""
         return bool(self.left_out) or stamp_ns - self.newest.stamp_ns >= _MOUNT_EVERY_S * NS_PER_S
 
-    def advance(self, newest: Newest, links: InertialLink, told: Mapping[str, Array]) -> None:
+    def advance(
+        self, newest: Newest, links: InertialLink, told: Mapping[str, Array], motion_model: MotionModel
+    ) -> None:
         """Follow the window to its newest state; nothing where that is not newer than the last (a window that was rebuilt).
 
         Args:
@@ -143,6 +146,8 @@ class UnmodelledError:
         F[:_CORE, :_CORE], Q[:_CORE, :_CORE] = _step(self.newest, newest, links)
         F[_CORE:, _CORE:], Q[_CORE:, _CORE:] = _walks(self.estimated.values(), dt_s)
         predicted, J = sound(F @ self.P @ F.T + Q), np.zeros((n, n))
+        if newest.unsure and not hole_within(links, self.newest.stamp_ns, newest.stamp_ns):
+            F, predicted = _by_motion_model(motion_model, self.newest, newest, self.P, F, Q)
         first = dict(
             zip(self.estimated, _CORE + np.cumsum([0, *(len(s.sigma) for s in self.estimated.values())]), strict=False)
         )
@@ -168,17 +173,26 @@ class UnmodelledError:
             raise ArithmeticError("what slow errors do to the newest state is not finite")
         self.newest, self.P, self.cov, self.by_mount = newest, P, 0.5 * (cov + cov.T), by_mount
 
-    def pose(self, lever_m: Array) -> Array:
+    def pose(self, lever_m: Array, standing: Array, ahead_s: float = 0.0) -> Array:
         """Return the covariance (6, 6) that comes on top of that of the place of a point of the body, and of the attitude, in axes of world.
 
         Args:
-            lever_m: (3,) the point from the IMU, axes of world. Of its place without the left-out errors.
+            lever_m: (3,) the point from the IMU, axes of world. standing: (3, 3), m^2, of the left-out errors: the place is off by that at
+                least. A height that is taken from the fixes once is, too, though here it counts as measured.
+            ahead_s: for how long the newest state is propagated by the IMU.
         """
+        of_point = np.zeros((6, 9))
+        of_point[:3, _ROTATION], of_point[:3, _POSITION], of_point[:3, _VELOCITY] = (
+            -skew(lever_m),
+            np.eye(3),
+            ahead_s * np.eye(3),
+        )
+        of_point[3:, _ROTATION] = np.eye(3)
+        cov = of_point @ self.cov[:9, :9] @ of_point.T
+        cov[:3, :3] += np.diag(np.maximum(np.diagonal(standing) - np.diagonal(cov)[:3], 0.0))
         turned = self.by_mount[_ROTATION] - self.newest.pose.rotation().matrix()
         by = np.vstack([self.by_mount[_POSITION] - skew(lever_m) @ turned, turned])
-        cov = self.mount_sigma_rad**2 * by @ by.T
-        cov[3:, 3:] += self.cov[_ROTATION, _ROTATION]
-        return cov
+        return np.asarray(cov + self.mount_sigma_rad**2 * by @ by.T)
 
     @property
     def velocity(self) -> Array:
@@ -197,6 +211,25 @@ def _walks(processes: Iterable[SlowProcess], dt_s: float) -> tuple[Array, Array]
     steps = [process.after(dt_s) for process in processes]
     kept, walk = (np.concatenate([np.zeros(0), *(step[n] for step in steps)]) for n in (0, 1))
     return np.diag(kept), np.diag(walk)
+
+
+def _by_motion_model(
+    model: MotionModel, before: Newest, newest: Newest, P: Array, F: Array, Q: Array
+) -> tuple[Array, Array]:
+    """Return F and the predicted covariance (n, n) where the motion model holds the velocity, too.
+
+    It measures b' v_b - phi a' v_a, with the variance of w (see `graphloc.motion_model`).
+    """
+    a, b = (state.pose.rotation().matrix()[:, :2].T for state in (before, newest))
+    phi, variance = model.process(a @ before.velocity, (newest.stamp_ns - before.stamp_ns) / NS_PER_S)
+    later = np.zeros((2, len(P)))
+    later[:, _VELOCITY] = b
+    by_before = later @ F
+    by_before[:, _VELOCITY] -= phi[:, None] * a
+    shared = F @ P @ by_before.T + Q @ later.T  # covariance of the newest state and what is measured
+    S = by_before @ P @ by_before.T + later @ Q @ later.T + np.diag(variance)
+    gain = np.linalg.solve(S, shared.T).T
+    return F - gain @ by_before, sound(F @ P @ F.T + Q - gain @ shared.T)
 
 
 def _step(before: Newest, newest: Newest, links: InertialLink) -> tuple[Array, Array]:
