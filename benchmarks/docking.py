@@ -28,10 +28,10 @@ from graphloc.factors import INERTIAL, SENSORS
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.recording import Recording
 from graphloc.solve import smooth
-from graphloc.solve._align import align
-from graphloc.solve._decide import Verdicts
 from graphloc.solve._grow import grow
 from graphloc.solve._start import solve_start
+from graphloc.solve.alignment import align
+from graphloc.solve.decide import Verdicts
 from graphloc.time import stamps_of
 
 SEEDS = {"illuminated": range(2)}  # of a condition

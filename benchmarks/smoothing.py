@@ -23,8 +23,8 @@ from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import compare_to_held_out, compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.frames import wrap_angle
-from graphloc.frontends._part import BagPart
 from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.frontends.part import BagPart
 from graphloc.measurements import GnssPosition
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory, bounds_95

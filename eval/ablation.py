@@ -13,7 +13,7 @@ from graphloc.eval.consistency import Contradiction
 from graphloc.eval.metrics import Levers, errors, held_out_errors
 from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import GnssPosition
-from graphloc.series import rms
+from graphloc.signals.series import rms
 from graphloc.solution import Solution
 from graphloc.trajectory import Trajectory, bounds_95
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from graphloc.eval.metrics import Table
 from graphloc.frames import Array
-from graphloc.series import rms
+from graphloc.signals.series import rms
 from graphloc.survey import Survey
 from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory

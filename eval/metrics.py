@@ -20,7 +20,7 @@ from graphloc.frames import Array, Datum, wrap_angle
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.plain import aligned
 from graphloc.recording import SpeedSeries
-from graphloc.series import interpolated, rms
+from graphloc.signals.series import interpolated, rms
 from graphloc.solution import SlowEstimate
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory

@@ -20,12 +20,12 @@ from graphloc.eval.ekf import FilterResult, as_pose, named_tracks
 from graphloc.eval.plots import colour_of
 from graphloc.extras import need
 from graphloc.frames import Array, Datum
-from graphloc.frontends._part import Bags
-from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.cloud import level
 from graphloc.frontends.aerial.image import AerialImage
 from graphloc.frontends.aerial.live import Turn, outside
 from graphloc.frontends.aerial.scans import ScanFeed
+from graphloc.frontends.part import Bags
+from graphloc.frontends.source import Bag
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import GnssPosition, Measurement, PoseFix, TagSighting, world_from_fixes
 from graphloc.recording import Recording

@@ -20,7 +20,7 @@ from graphloc.frontends.tags.pose import poses_of
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import GnssPosition, TagSighting, world_from_fixes
 from graphloc.recording import Recording
-from graphloc.series import interpolated, rms
+from graphloc.signals.series import interpolated, rms
 from graphloc.solution import Solution
 from graphloc.time import stamps_of
 

@@ -38,7 +38,7 @@ from graphloc.config import ImuConfig
 from graphloc.frames import Array
 from graphloc.graph import Going
 from graphloc.measurements import ImuSeries
-from graphloc.series import integral, interpolated
+from graphloc.signals.series import integral, interpolated
 
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # white noise of unknown motion in a gap
 _SHORT_S = 2.0  # longest gap that is interpolated linearly

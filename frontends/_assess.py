@@ -20,10 +20,10 @@ from graphloc.frontends._reports import GnssReport, PartOfFixes, TopicReport, Ve
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import IMU, PLAIN_POSE, POSE, UNSTAMPED
-from graphloc.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.measurements import GnssPosition, world_from_fixes
+from graphloc.signals.frozen_receiver import frozen_fixes, frozen_fixes_warning
+from graphloc.signals.white_noise import white_noise
 from graphloc.time import NS_PER_S, stamps_of
-from graphloc.white_noise import white_noise
 
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
 _EITHER = 0.01  # share of the fixes, at least, of RTK and of others, where it comes and goes

@@ -13,9 +13,9 @@ from graphloc.frontends._assess import Courses, sane
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, two_antennas
 from graphloc.frontends._streams import TopicData
-from graphloc.frontends._turning import Turning, against_turning, follows_turning
 from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, QUATERNION, yaw_of_x_axis
-from graphloc.series import robust_sigma
+from graphloc.frontends.turning import Turning, against_turning, follows_turning
+from graphloc.signals.series import robust_sigma
 from graphloc.time import NS_PER_S
 
 _FEWEST, _FEWEST_COURSES = 10, 20

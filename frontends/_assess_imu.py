@@ -29,13 +29,13 @@ from graphloc.frontends._sanity import (
 )
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._turning import Turning, course_against_turning, left_of_turns
-from graphloc.frozen_imu import frozen_imu_warning, frozen_samples
-from graphloc.imu_spikes import spike_warning, spikes
+from graphloc.frontends.turning import Turning, course_against_turning, left_of_turns
 from graphloc.measurements import ImuSeries
-from graphloc.series import integral, runs
+from graphloc.signals.frozen_imu import frozen_imu_warning, frozen_samples
+from graphloc.signals.imu_spikes import spike_warning, spikes
+from graphloc.signals.series import integral, runs
+from graphloc.signals.white_noise import white_noise
 from graphloc.time import NS_PER_S
-from graphloc.white_noise import white_noise
 
 _LEFT_OF_TURNS = 0.5  # of the changes of a course, that the turning about the right axis leaves at most
 _UPSIDE_DOWN_DEG = 150.0

@@ -14,8 +14,8 @@ from graphloc.frontends._assess import track
 from graphloc.frontends._clock import MOST_LATE_S
 from graphloc.frontends._reports import GnssReport
 from graphloc.frontends._streams import TopicData
-from graphloc.frozen_receiver import frozen_fixes
-from graphloc.series import interpolated
+from graphloc.signals.frozen_receiver import frozen_fixes
+from graphloc.signals.series import interpolated
 from graphloc.time import NS_PER_S
 
 _FEWEST, _LAG_S = 20, 0.1

@@ -26,7 +26,7 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import Pose
 from graphloc.frontends.decode import ODOMETRY, VECTOR
-from graphloc.series import integral, interpolated
+from graphloc.signals.series import integral, interpolated
 from graphloc.time import NS_PER_S
 
 _CHORD_S, _LONG_CHORD_S = 2.0, 10.0  # in which a craft turns little; and over which fixes wander by less than it goes

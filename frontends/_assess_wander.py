@@ -13,7 +13,7 @@ from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion, motion_of_places, sane
 from graphloc.frontends._reports import Change
 from graphloc.frontends._streams import TopicData
-from graphloc.series import interpolated, rms, robust_sigma
+from graphloc.signals.series import interpolated, rms, robust_sigma
 from graphloc.time import NS_PER_S
 
 SPANS_S = (10.0, 20.0, 40.0, 80.0)

@@ -13,7 +13,7 @@ from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._assess import sane, vec
 from graphloc.frontends._reports import Vec
 from graphloc.frontends._streams import TopicData
-from graphloc.series import interpolated
+from graphloc.signals.series import interpolated
 from graphloc.time import NS_PER_S
 
 _EXTENT_M = 20.0  # a shorter way does not tell directions

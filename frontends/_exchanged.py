@@ -11,7 +11,7 @@ from graphloc.config import VelocityConfig
 from graphloc.frontends._assess import MeasuredMotion
 from graphloc.frontends._readings import Readings
 from graphloc.measurements import GnssVelocity
-from graphloc.series import interpolated
+from graphloc.signals.series import interpolated
 from graphloc.time import NS_PER_S, stamps_of
 
 _HALF_S = 1.0  # of a chord

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from graphloc.config import GnssConfig
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.measurements import GnssPosition, world_from_fixes
+from graphloc.signals.white_noise import white_noise_of_thirds
 from graphloc.time import NS_PER_S, stamps_of
-from graphloc.white_noise import white_noise_of_thirds
 
 _HELD_S = 2.5
 """A place that is repeated for less, and then changes, was held by a driver; for longer, the receiver itself stands still."""

@@ -16,8 +16,8 @@ from scipy.ndimage import uniform_filter1d
 
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import MeasuredMotion
-from graphloc.frontends._turning import Turning
-from graphloc.series import integral
+from graphloc.frontends.turning import Turning
+from graphloc.signals.series import integral
 from graphloc.time import NS_PER_S
 
 # Half the time over which an acceleration is asked: short, a car's fits best; longer, waves and the noise of fixes are less.

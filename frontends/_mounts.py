@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from graphloc.blocks import MountConfig
 from graphloc.frames import Array
 from graphloc.frontends._sanity import lever_warning
-from graphloc.frontends._source import TF_MOVING, TF_STATIC, Bag
 from graphloc.frontends._tf import StaticTree
+from graphloc.frontends.source import TF_MOVING, TF_STATIC, Bag
 
 
 def mounts_of(

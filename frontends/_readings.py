@@ -26,12 +26,12 @@ from graphloc.frontends._references import Reference
 from graphloc.frontends._rejections import Rejection, rejected
 from graphloc.frontends._turns import SCATTERED, scattered
 from graphloc.frontends.decode import Decoded, ImuReading
-from graphloc.frozen_imu import WHY, frozen_imu_warning, frozen_samples
-from graphloc.imu_spikes import WHY as SPIKE
-from graphloc.imu_spikes import spike_warning, spikes
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
-from graphloc.thinning import THINNED, Thinning
+from graphloc.signals.frozen_imu import WHY, frozen_imu_warning, frozen_samples
+from graphloc.signals.imu_spikes import WHY as SPIKE
+from graphloc.signals.imu_spikes import spike_warning, spikes
+from graphloc.signals.thinning import THINNED, Thinning
 from graphloc.time import NS_PER_S, utc_text
 
 _Kind = TypeVar("_Kind")

@@ -18,7 +18,6 @@ from graphloc.frames import Array
 from graphloc.frontends import nmea
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import FILTER, WATER
-from graphloc.frontends._source import TF_MOVING, TF_STATIC, Bag, RawMessage
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.decode import (
     GPS_FIXES,
@@ -40,6 +39,7 @@ from graphloc.frontends.decode import (
     nmea_sigmas_m,
     stamp_ns_of,
 )
+from graphloc.frontends.source import TF_MOVING, TF_STATIC, Bag, RawMessage
 from graphloc.frontends.vendors import (
     GEOGRAPHIC,
     VENDORS,

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.errors import InputError
 from graphloc.frames import Array
-from graphloc.frontends._source import TF_MOVING, TF_STATIC, RawMessage
 from graphloc.frontends.decode import TF, is_unit
+from graphloc.frontends.source import TF_MOVING, TF_STATIC, RawMessage
 
 # Names of the body frame, likeliest first.
 WORLD_NAMES = ("map", "odom", "world", "earth", "utm", "camera_init")  # the last by LOAM

@@ -13,7 +13,7 @@ from graphloc.config import CompassConfig, ImuConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import CompassHeading, ImuSeries
-from graphloc.series import integral, rms
+from graphloc.signals.series import integral, rms
 from graphloc.time import NS_PER_S, stamps_of
 
 _BLOCK_S = 120.0  # within it a gyro's bias and a compass's offset are steady

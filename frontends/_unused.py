@@ -11,9 +11,9 @@ import numpy as np
 from graphloc.frontends._assess import sane
 from graphloc.frontends._assess_imu import samples_of
 from graphloc.frontends._reader import either
-from graphloc.frontends._source import TopicSummary
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import GPS_FIXES, IMU, NAV_SAT_FIX, NUMBERS
+from graphloc.frontends.source import TopicSummary
 
 _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
 _MAGNETIC = "sensor_msgs/msg/MagneticField"

@@ -29,7 +29,6 @@ from graphloc.frontends._assess import MeasuredMotion, courses_of_fixes, motion_
 from graphloc.frontends._clock import ScanClock, corrected_ns, usual_latency_s
 from graphloc.frontends._exchanged import exchanged_warnings
 from graphloc.frontends._mount_yaw import yaw_in_craft
-from graphloc.frontends._part import Bags
 from graphloc.frontends._reader import Reader, either
 from graphloc.frontends._readings import (
     Readings,
@@ -47,7 +46,6 @@ from graphloc.frontends._readings import (
 )
 from graphloc.frontends._references import Reference, check_speed, true_trajectory
 from graphloc.frontends._sanity import lever_warning
-from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import Yaws, pose_turn_warning, refuse_unit, scale_warning, turn_warnings, wander_warning
 from graphloc.frontends.decode import (
@@ -60,6 +58,8 @@ from graphloc.frontends.decode import (
     stamp_ns_of,
     supported_types,
 )
+from graphloc.frontends.part import Bags
+from graphloc.frontends.source import Bag, TopicSummary
 from graphloc.frontends.vendors import VENDORS
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix

@@ -65,11 +65,8 @@ from graphloc.frontends._reports import (
     VelocityReport,
     filtered,
 )
-from graphloc.frontends._source import Bag, TopicSummary
 from graphloc.frontends._streams import Sentences, TopicData, read_streams
 from graphloc.frontends._tf import WORLD_NAMES, Pose, StaticTree
-from graphloc.frontends._time_offsets import MotionOffset, heading_time_offset, later_than, motion_time_offset
-from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
 from graphloc.frontends._unused import unread_lidars, unread_tags, unused_magnetometers, unused_numbers, unused_topics
 from graphloc.frontends.aerial.cloud import CLOUDS
@@ -89,13 +86,16 @@ from graphloc.frontends.decode import (
     VECTOR,
     header_stamp_ns,
 )
+from graphloc.frontends.source import Bag, TopicSummary
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic, is_rectified
-from graphloc.frozen_receiver import frozen_fixes
+from graphloc.frontends.time_offsets import MotionOffset, heading_time_offset, later_than, motion_time_offset
+from graphloc.frontends.turning import Turning
 from graphloc.measurements import CompassHeading
-from graphloc.pauses import common_pauses, pauses_warning
+from graphloc.signals.frozen_receiver import frozen_fixes
+from graphloc.signals.pauses import common_pauses, pauses_warning
+from graphloc.signals.white_noise import white_noise
 from graphloc.time import NS_PER_S, seconds_between
-from graphloc.white_noise import white_noise
 
 __all__ = [
     "CompassReport",

@@ -20,14 +20,14 @@ from graphloc.errors import SolveError
 from graphloc.estimate import Estimate, Event
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum
-from graphloc.frontends._source import Bag
+from graphloc.frontends.source import Bag
 from graphloc.gather import Gathering, LiveMatching, Scans, with_busy_warning
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement, TagSighting
 from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
 from graphloc.solution import Cause, Solution, SolveStats
-from graphloc.solve._warnings import disagreement_warning, joint_rejection_warning
+from graphloc.solve.warnings import disagreement_warning, joint_rejection_warning
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from graphloc.chi2 import SIGMAS_95, chi2_95
 from graphloc.frames import Array, rpy_from_rotation, yaw_from_rotation
-from graphloc.series import interpolated
+from graphloc.signals.series import interpolated
 from graphloc.time import seconds_since
 
 _MOST_APART_S = 1.0  # poses between which the vessel is taken for known

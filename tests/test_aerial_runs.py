@@ -24,7 +24,6 @@ from graphloc.errors import InputError
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate.harbour import load_harbour
 from graphloc.frames import Array, Datum, rotation_from_rpy_deg
-from graphloc.frontends._source import RawMessage
 from graphloc.frontends.aerial import Match, Prior, live, match_bag, matcher, scans
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud
 from graphloc.frontends.aerial.match import Mode
@@ -32,6 +31,7 @@ from graphloc.frontends.aerial.matcher import Since
 from graphloc.frontends.aerial.scan import LevelCloud, outline
 from graphloc.frontends.aerial.scans import Matched
 from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.frontends.source import RawMessage
 from graphloc.gather import _matches, with_matches
 from graphloc.gather._matches import Matches, few_matches, turned_heading
 from graphloc.recording import Recording

@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 VOCABULARY = {
-    "errors", "time", "chi2", "gauss", "frames", "measurements", "ledger", "trajectory", "config", "recording", "offsets", "solution", "estimate", "plain", "blocks", "frozen_imu", "imu_spikes", "imu_scatter", "frozen_receiver", "position_jumps", "pauses", "survey", "berths", "extras", "thinning", "white_noise", "series", "folders", "_config_docs",
+    "errors", "time", "chi2", "gauss", "frames", "measurements", "ledger", "trajectory", "config", "recording", "offsets", "solution", "estimate", "plain", "blocks", "signals", "survey", "berths", "extras", "folders", "_config_docs",
 }  # fmt: skip
 DOOR = {"__main__", "app", "cli", "drills", "found_tags", "gather", "replay", "stream", "job", "sweep", "ablations"}
 GRAPH = {"graph", "linear", "motion_model", "keys", "timeline", "build", "solve", "online", "origin", "outputs"}
@@ -55,6 +55,23 @@ def test_imports_go_one_way(path: Path) -> None:
     forbidden = FORBIDDEN[kind_of(path)]
     bad = {i for i in imports_of(path) if any(i == f or i.startswith(f + ".") for f in forbidden)}
     assert not bad
+
+
+def _name_of(path: Path) -> str:
+    """As it is imported."""
+    dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    return dotted if dotted.startswith("graphloc") else f"graphloc.{dotted}"
+
+
+def test_a_private_module_is_of_its_package_alone() -> None:
+    """`_x.py` may change as its package likes: what another one imports is public, and says so by its name."""
+    names = {_name_of(path) for path in MODULES}
+    for path in MODULES:
+        package = _name_of(path) if path.stem == "__init__" else _name_of(path).rpartition(".")[0]
+        for found in imports_of(path) & names:
+            home, _, name = found.rpartition(".")
+            private = name.startswith("_") and not name.startswith("__")
+            assert not private or f"{package}.".startswith(f"{home}."), f"{path}: {found}"
 
 
 def test_only_the_door_opens_to_all() -> None:

@@ -28,12 +28,12 @@ from graphloc.config import (
 )
 from graphloc.errors import InputError
 from graphloc.frames import Datum
-from graphloc.frontends._source import Bag
 from graphloc.frontends.bag import read_recording
+from graphloc.frontends.source import Bag
 from graphloc.ledger import Ledger, Outcome
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity
 from graphloc.recording import Recording
-from graphloc.thinning import THINNED
+from graphloc.signals.thinning import THINNED
 from tests.bagfactory import START_NS, Messages, S, still_run, write_bag
 
 KINDS: dict[str, type[SensorConfig]] = {

@@ -32,7 +32,7 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import BodyVelocity, GnssPosition
 from graphloc.recording import Recording
 from graphloc.replay import replay
-from graphloc.thinning import THINNED
+from graphloc.signals.thinning import THINNED
 from tests.bagfactory import START_NS, Messages
 from tests.slowly import simulate_slowly
 

@@ -15,7 +15,7 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.graph import SlowProcess
 from graphloc.measurements import GnssVelocity
-from graphloc.solve._covariances import world_covariance
+from graphloc.solve.covariances import world_covariance
 
 LEVER_M = np.array([-5.0, 2.0, 2.0])
 GYRO_BIAS_RADPS = 0.05

@@ -16,15 +16,15 @@ from graphloc.eval.calibrate._evidence import Evidence, OffsetEstimate
 from graphloc.eval.calibrate._imu import imu_noise
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
-from graphloc.frontends._time_offsets import heading_time_offset
-from graphloc.frontends._turning import Turning
 from graphloc.frontends.bag import read_recording
-from graphloc.imu_scatter import noise_density
+from graphloc.frontends.time_offsets import heading_time_offset
+from graphloc.frontends.turning import Turning
 from graphloc.measurements import GnssVelocity, ImuSeries
 from graphloc.offsets import Misfit, Offset, Offsets, joined
+from graphloc.signals.imu_scatter import noise_density
 from graphloc.solve import smooth
-from graphloc.solve._imu_noise import imu_misfit
-from graphloc.solve._linearised import normal_solver
+from graphloc.solve.imu_noise import imu_misfit
+from graphloc.solve.linearised import normal_solver
 from tests.bagfactory import Messages
 from tests.slowly import simulate_slowly
 from tests.test_inspect import drive, look

@@ -20,7 +20,7 @@ from graphloc.eval import report
 from graphloc.eval.simulate import Scenario, bl_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.ledger import Ledger, LedgerRow, Outcome
-from graphloc.thinning import THINNED
+from graphloc.signals.thinning import THINNED
 from tests.commands import called
 from tests.slowly import simulate_slowly
 

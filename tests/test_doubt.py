@@ -17,9 +17,9 @@ from graphloc.graph import Decision, FalseModel, Residual
 from graphloc.measurements import Measurement, PoseFix
 from graphloc.solution import Graded
 from graphloc.solve import _solution
-from graphloc.solve._batch import BatchResult
 from graphloc.solve._doubt import ambiguity, doubt_of, probability_false, widening
 from graphloc.solve._solution import _add_doubt
+from graphloc.solve.batch import BatchResult
 from tests.slowly import simulate_slowly
 
 SECOND = 1_000_000_000

@@ -15,11 +15,11 @@ from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import inspect_bag, render
-from graphloc.frozen_imu import FrozenImuDetector, frozen_samples
 from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample
 from graphloc.online import OnlineSmoother
 from graphloc.replay import replay
+from graphloc.signals.frozen_imu import FrozenImuDetector, frozen_samples
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.faults import Arrival, Arrivals, arrivals_of, complaints, feed, finish
 from tests.slowly import simulate_slowly

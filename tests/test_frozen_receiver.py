@@ -13,11 +13,11 @@ from graphloc import app
 from graphloc.eval.simulate import Scenario
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.inspect import inspect_bag, render
-from graphloc.frozen_receiver import frozen_fixes, frozen_velocities
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, PoseFix
 from graphloc.online._repeated_fix import RepeatedFixDetector
 from graphloc.online._repeated_velocity import RepeatedVelocityDetector
+from graphloc.signals.frozen_receiver import frozen_fixes, frozen_velocities
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.slowly import simulate_slowly
 

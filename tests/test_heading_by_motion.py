@@ -27,9 +27,9 @@ from graphloc.online._window import Window
 from graphloc.recording import Recording, quiet
 from graphloc.replay import arrivals
 from graphloc.solution import Cause, Health, Solution
-from graphloc.solve import _align, _start
-from graphloc.solve._align import align, wanted_travel_m
+from graphloc.solve import _start, alignment
 from graphloc.solve._start import solve_start
+from graphloc.solve.alignment import align, wanted_travel_m
 from graphloc.trajectory import bounds_95
 from tests.slowly import with_few_states
 
@@ -271,7 +271,7 @@ def test_the_least_travel_counts_where_nothing_else_tells_the_heading_and_early(
     """A square of 6 m, by fixes good to 0.6 m. What takes minutes may be drift."""
     monkeypatch.setattr(sys.modules[__name__], "FIX_M", 0.6)
     recording, config, _, _ = robot(1, 34.0, *np.arange(4.0, 30.0, 7.0), speed_mps=speed_mps)
-    monkeypatch.setattr(_align, "_LATEST_S", 120.0 / slower)
+    monkeypatch.setattr(alignment, "_LATEST_S", 120.0 / slower)
     config = config.model_copy(update={"start": config.start.model_copy(update={"heading_deg": stated_deg})})
     datum = app.choose_datum(recording, config)
     assert align(make_problem(recording, config, datum, SENSORS, INERTIAL)).by_motion is by_motion

@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from graphloc.frontends._assess import MeasuredMotion
 from graphloc.frontends._mount_yaw import Felt
-from graphloc.frontends._time_offsets import MotionOffset, motion_time_offset
+from graphloc.frontends.time_offsets import MotionOffset, motion_time_offset
 
 G = 9.81
 

@@ -15,11 +15,11 @@ from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
 from graphloc.measurements import Measurement, PoseFix
 from graphloc.replay import replay
-from graphloc.solve._best_chain import best_chain
-from graphloc.solve._decide import Verdict, by_hypotheses
-from graphloc.solve._hypotheses import FalseSequence
-from graphloc.solve._prediction import Prediction
-from graphloc.solve._warnings import joint_rejection_warning
+from graphloc.solve.best_chain import best_chain
+from graphloc.solve.decide import Verdict, by_hypotheses
+from graphloc.solve.hypotheses import FalseSequence
+from graphloc.solve.prediction import Prediction
+from graphloc.solve.warnings import joint_rejection_warning
 from tests.slowly import simulate_slowly, sparsely
 
 SIGMA_M = 0.2

@@ -26,7 +26,7 @@ from graphloc.online._lag import Lag
 from graphloc.online._tracking import Tracking
 from graphloc.recording import Recording, quiet
 from graphloc.solution import Health, Solution
-from graphloc.solve import _first_solution, _wrong_imu
+from graphloc.solve import _first_solution, wrong_imu
 from graphloc.solve._start import Begun
 from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
 from tests.slowly import slowly
@@ -114,7 +114,7 @@ def test_sensors_that_no_motion_explains_are_not_believed_against_the_imu(change
 
 
 @pytest.mark.parametrize(
-    ("where", "guard", "value"), [(_wrong_imu, "_MOTION", 0.0), (_lag, "_EXPLAINED", 1.1)], ids=["motion", "explained"]
+    ("where", "guard", "value"), [(wrong_imu, "_MOTION", 0.0), (_lag, "_EXPLAINED", 1.1)], ids=["motion", "explained"]
 )
 def test_it_is_left_out_only_where_a_motion_of_a_vessel_explains_the_denials(
     where: ModuleType, guard: str, value: float, monkeypatch: pytest.MonkeyPatch

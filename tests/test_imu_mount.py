@@ -16,9 +16,9 @@ from graphloc.frames import wrap_angle
 from graphloc.recording import Recording
 from graphloc.replay import replay
 from graphloc.solution import Solution
-from graphloc.solve._batch import BatchResult
-from graphloc.solve._imu_mount import MountError, mount_error
 from graphloc.solve._solution import make_solution
+from graphloc.solve.batch import BatchResult
+from graphloc.solve.imu_mount import MountError, mount_error
 from tests.slowly import simulate_slowly
 
 ASKEW_DEG = (0.0, 0.0, 3.0)

@@ -12,11 +12,11 @@ from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import inspect_bag, render
-from graphloc.imu_spikes import SpikeDetector, spikes
 from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample
 from graphloc.online import OnlineSmoother
 from graphloc.online._intake import ImuIntake
+from graphloc.signals.imu_spikes import SpikeDetector, spikes
 from tests.bagfactory import START_NS, S
 from tests.faults import arrivals_of, complaints, feed, finish, numbered
 from tests.slowly import simulate_slowly

@@ -17,11 +17,11 @@ from graphloc.frames import Array, Datum, Geodetic, rotation_from_rpy_deg
 from graphloc.frontends._assess_velocity import EITHER, axes_of, velocity_report
 from graphloc.frontends._fixes import radians_warning
 from graphloc.frontends._reports import BODY_AXES, EAST_AXES
-from graphloc.frontends._source import Bag, RawMessage
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import TWIST
 from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, render
+from graphloc.frontends.source import Bag, RawMessage
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.commands import called

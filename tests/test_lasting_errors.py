@@ -32,9 +32,9 @@ from graphloc.measurements import Measurement, PoseFix
 from graphloc.online._snapshot import Snapshot
 from graphloc.replay import replay
 from graphloc.solution import Graded
-from graphloc.solve._decide import Verdict
 from graphloc.solve._lasting import lasting_error
-from graphloc.solve._warnings import _lasting_error
+from graphloc.solve.decide import Verdict
+from graphloc.solve.warnings import _lasting_error
 from tests.faults import arrivals_of, feed
 from tests.slowly import simulate_slowly
 from tests.test_factors import attachment

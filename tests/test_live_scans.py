@@ -18,7 +18,6 @@ from graphloc.blocks import MountConfig
 from graphloc.config import AerialConfig, LidarConfig
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends import decode
-from graphloc.frontends._source import Bag, RawMessage, TopicSummary
 from graphloc.frontends.aerial import live, match_bag, scans
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud, level
 from graphloc.frontends.aerial.live import LiveMatcher, Matched
@@ -27,6 +26,7 @@ from graphloc.frontends.aerial.matcher import Match, Matcher, Prior, Since
 from graphloc.frontends.aerial.scan import LevelCloud, outline
 from graphloc.frontends.aerial.scans import ScanFeed
 from graphloc.frontends.aerial.submap import Turn
+from graphloc.frontends.source import Bag, RawMessage, TopicSummary
 from graphloc.recording import Mounts
 from graphloc.trajectory import Trajectory
 

@@ -12,10 +12,10 @@ import pytest
 from graphloc.config import AerialConfig
 from graphloc.frames import Array
 from graphloc.frontends._livox import LIVOX, livox_cloud
-from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.cloud import decode_cloud
 from graphloc.frontends.aerial.scans import ScanFeed
 from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.frontends.source import Bag
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 
 MS = 1_000_000

@@ -23,8 +23,8 @@ from graphloc.measurements import CompassHeading, GnssPosition, HeightPrior, Mea
 from graphloc.recording import Recording
 from graphloc.replay import replay
 from graphloc.solution import Solution
-from graphloc.solve._align import _level, _turns, align
 from graphloc.solve._parts import _join_stats
+from graphloc.solve.alignment import _level, _turns, align
 from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory, bounds_95
 from tests.slowly import simulate_slowly

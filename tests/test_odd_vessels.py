@@ -17,7 +17,7 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, rpy_from_rotation
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.measurements import GnssPosition
-from graphloc.thinning import THINNED
+from graphloc.signals.thinning import THINNED
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import Item, Messages, write_bag
 from tests.slowly import with_few_states

@@ -21,7 +21,7 @@ from graphloc.frames import Array, wrap_angle
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, PoseFix, PoseMode
 from graphloc.online import OnlineSmoother, _start, _waiting
-from graphloc.thinning import THINNED
+from graphloc.signals.thinning import THINNED
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 from tests.faults import Arrival, Arrivals, Fed, arrivals_of, complaints, delayed, feed, finish

@@ -12,7 +12,7 @@ from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.solve import _on_deep_stack, _passes
 from graphloc.solve._optimize import bayes_tree, full_step, optimize
-from graphloc.solve._stretch import moved
+from graphloc.solve.stretch import moved
 
 
 def loop(heading_sigma_rad: float) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:

@@ -22,7 +22,9 @@ from graphloc.graph import Residual
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, Measurement
 from graphloc.online import OnlineSmoother
 from graphloc.online import _start as online_start
-from graphloc.position_jumps import (
+from graphloc.recording import Recording
+from graphloc.replay import arrivals, replay
+from graphloc.signals.position_jumps import (
     JumpDetector,
     OffPrediction,
     PositionJump,
@@ -30,15 +32,13 @@ from graphloc.position_jumps import (
     jumps_off_track,
     position_jumps,
 )
-from graphloc.recording import Recording
-from graphloc.replay import arrivals, replay
 from graphloc.solution import Health, Solution
-from graphloc.solve import _batch, _first_solution, _grow
-from graphloc.solve._decide import Stage, _by_kernel, weigh
+from graphloc.solve import _first_solution, _grow, batch
 from graphloc.solve._first_solution import first_solution
 from graphloc.solve._grow import grow
 from graphloc.solve._jumps import jumps_in, with_jumps_off_track
-from graphloc.solve._stretch import StretchStep, solve_stretch
+from graphloc.solve.decide import Stage, _by_kernel, weigh
+from graphloc.solve.stretch import StretchStep, solve_stretch
 from tests.slowly import simulate_slowly, with_few_states
 
 _FINE_FIXES = Scenario(gnss_sigma_m=0.05, gnss_reported_sigma_m=0.21, imu_hz=50.0)
@@ -587,7 +587,7 @@ def test_a_run_whose_slow_error_is_off_is_not_solved_again_for_jumps() -> None:
 
 def test_a_run_that_cannot_be_solved_with_its_jumps_is_solved_without(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = lone_problem()
-    right = _batch.solve_batch(problem)
+    right = batch.solve_batch(problem)
     jumped = with_jumps_off_track(problem, off_at(problem, 4.1))
     assert jumped is not None
 
@@ -596,9 +596,9 @@ def test_a_run_that_cannot_be_solved_with_its_jumps_is_solved_without(monkeypatc
             raise SolveError("not with these")
         return first_solution(given, *args, **options)
 
-    monkeypatch.setattr(_batch, "with_jumps_off_track", lambda *_: jumped)
-    monkeypatch.setattr(_batch, "first_solution", only_without)
-    found = _batch.solve_batch(problem)
+    monkeypatch.setattr(batch, "with_jumps_off_track", lambda *_: jumped)
+    monkeypatch.setattr(batch, "first_solution", only_without)
+    found = batch.solve_batch(problem)
     assert found.stated is problem
     last = keys.pose(len(problem.timeline) - 1)
     assert found.values.atPose3(last).equals(right.values.atPose3(last), 1e-3)
@@ -607,10 +607,10 @@ def test_a_run_that_cannot_be_solved_with_its_jumps_is_solved_without(monkeypatc
 def test_jumps_that_do_not_make_the_run_clearly_more_probable_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a receiver whose fixes wandered by metres within seconds seven were: 15 m off, and 3 m without them."""
     problem = lone_problem()
-    right = _batch.solve_batch(problem)
+    right = batch.solve_batch(problem)
     jumped = with_jumps_off_track(problem, off_at(problem, 4.1, 8.1))
-    monkeypatch.setattr(_batch, "with_jumps_off_track", lambda *_: jumped)
-    found = _batch.solve_batch(problem)
+    monkeypatch.setattr(batch, "with_jumps_off_track", lambda *_: jumped)
+    found = batch.solve_batch(problem)
     assert found.stated is problem
     last = keys.pose(len(problem.timeline) - 1)
     assert found.values.atPose3(last).equals(right.values.atPose3(last), 1e-3)
@@ -623,9 +623,9 @@ def test_a_jump_has_to_be_worth_the_place_and_the_size_that_are_chosen_for_it(
     """Fixes that wandered between high houses had 19 of 15 nats each: 17 m off, and 2.8 m without them."""
     problem = lone_problem()
     jumped = with_jumps_off_track(problem, off_at(problem, 4.1, 8.1))
-    monkeypatch.setattr(_batch, "with_jumps_off_track", lambda given, *_: jumped if given is problem else None)
-    monkeypatch.setattr(_batch, "cost_of_run", lambda given, *_: 500.0 - each * jumps_in(given))
-    assert jumps_in(_batch.solve_batch(problem).stated) == taken
+    monkeypatch.setattr(batch, "with_jumps_off_track", lambda given, *_: jumped if given is problem else None)
+    monkeypatch.setattr(batch, "cost_of_run", lambda given, *_: 500.0 - each * jumps_in(given))
+    assert jumps_in(batch.solve_batch(problem).stated) == taken
 
 
 def test_jumps_found_with_noise_that_needs_another_start_are_stated(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -639,11 +639,11 @@ def test_jumps_found_with_noise_that_needs_another_start_are_stated(monkeypatch:
         begun, solved = first_solution(*args, **options)
         return begun._replace(start=replace(begun.start, by_motion=True)), solved
 
-    monkeypatch.setattr(_batch, "with_jumps_off_track", lambda *_: seen.pop(0))
-    monkeypatch.setattr(_batch, "with_needed_noise", lambda *_: noisier.pop(0))
-    monkeypatch.setattr(_batch, "first_solution", by_motion)
-    monkeypatch.setattr(_batch, "_OF_A_JUMP", -np.inf)  # these fixes do not jump
-    found = _batch.solve_batch(problem)
+    monkeypatch.setattr(batch, "with_jumps_off_track", lambda *_: seen.pop(0))
+    monkeypatch.setattr(batch, "with_needed_noise", lambda *_: noisier.pop(0))
+    monkeypatch.setattr(batch, "first_solution", by_motion)
+    monkeypatch.setattr(batch, "_OF_A_JUMP", -np.inf)  # these fixes do not jump
+    found = batch.solve_batch(problem)
     assert seen == noisier == []
     for of in (found.problem, found.stated):
         assert receiver_of(of).slow is not None

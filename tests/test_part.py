@@ -20,9 +20,9 @@ from graphloc.cli._shared import BagOptions
 from graphloc.errors import InputError
 from graphloc.eval.simulate import Scenario
 from graphloc.eval.simulate.bag import write_bag as write_simulated
-from graphloc.frontends._part import BagPart
-from graphloc.frontends._source import Bag, RawMessage
 from graphloc.frontends.bag import read_recording
+from graphloc.frontends.part import BagPart
+from graphloc.frontends.source import Bag, RawMessage
 from graphloc.frontends.tags.sightings import sightings_of_bag
 from graphloc.ledger import Outcome
 from graphloc.recording import Recording, quiet

@@ -16,7 +16,7 @@ from graphloc.frames import Array
 from graphloc.frontends.inspect import inspect_bag
 from graphloc.graph import Going
 from graphloc.measurements import ImuSeries
-from graphloc.pauses import Stamps, common_pauses
+from graphloc.signals.pauses import Stamps, common_pauses
 from tests.bagfactory import START_NS, Messages, write_bag
 from tests.slowly import simulate_slowly
 from tests.test_inspect import drive

@@ -21,10 +21,10 @@ from graphloc.eval.holdout import HoldOut, telling
 from graphloc.eval.report import Trust, verdict
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, Geodetic
-from graphloc.frozen_receiver import FROZEN
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Recording
+from graphloc.signals.frozen_receiver import FROZEN
 from graphloc.solution import Cause, Health, Solution
 from graphloc.solve._levels import _drawn_anew
 from graphloc.trajectory import bounds_95

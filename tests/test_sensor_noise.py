@@ -28,8 +28,8 @@ from graphloc.online._scatter import Scatter
 from graphloc.online._sensor_noise import SensorNoise
 from graphloc.online._snapshot import Snapshot
 from graphloc.replay import arrivals, replay
-from graphloc.solve._batch import solve_batch
-from graphloc.solve._sensor_noise import Pair, Step, times_stated
+from graphloc.solve.batch import solve_batch
+from graphloc.solve.sensor_noise import Pair, Step, times_stated
 from graphloc.time import stamps_of
 from tests.faults import Fed, arrivals_of, feed
 from tests.slowly import simulate_slowly

@@ -8,9 +8,9 @@ import pytest
 
 from graphloc.errors import InputError
 from graphloc.frontends._clock import set_backs
-from graphloc.frontends._part import BagPart
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import inspect_bag
+from graphloc.frontends.part import BagPart
 from graphloc.ledger import Outcome
 from graphloc.recording import Recording
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag

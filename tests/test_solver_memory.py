@@ -20,9 +20,9 @@ from graphloc.eval.calibrate import PROBE
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.solve import _final_passes, smooth
-from graphloc.solve._batch import BatchResult, solve_batch
 from graphloc.solve._memory import give_back_memory
 from graphloc.solve._offsets import offsets_of
+from graphloc.solve.batch import BatchResult, solve_batch
 
 PIECE, PIECES = 4096, 20_000  # bytes; small enough for the heap
 

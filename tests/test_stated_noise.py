@@ -15,20 +15,20 @@ from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import wrap_angle
-from graphloc.imu_scatter import noise_density
 from graphloc.measurements import CompassHeading, Measurement, PoseFix
 from graphloc.recording import Recording, quiet
 from graphloc.replay import replay
+from graphloc.signals.imu_scatter import noise_density
 from graphloc.solution import Solution
-from graphloc.solve import _imu_noise
-from graphloc.solve._align import align
-from graphloc.solve._batch import BatchResult
-from graphloc.solve._decide import Stage, weigh
+from graphloc.solve import imu_noise
 from graphloc.solve._passes import settle
-from graphloc.solve._scatter import noisier_than_stated, white_scatter
 from graphloc.solve._solution import make_solution
 from graphloc.solve._start import solve_start
-from graphloc.solve._stretch import unwound
+from graphloc.solve.alignment import align
+from graphloc.solve.batch import BatchResult
+from graphloc.solve.decide import Stage, weigh
+from graphloc.solve.scatter import noisier_than_stated, white_scatter
+from graphloc.solve.stretch import unwound
 from tests.slowly import slowly
 
 SECOND = 1_000_000_000
@@ -190,7 +190,7 @@ def test_where_normal_equations_do_not_tell_the_noise_the_solution_stands(monkey
         raise RuntimeError("Factor is exactly singular")
 
     run = shaken(1, 10.0)
-    monkeypatch.setattr(_imu_noise, "normal_solver", singular)
+    monkeypatch.setattr(imu_noise, "normal_solver", singular)
     solution = app.smooth_recording(run.recording, by_data_sheet(run)).solution
     assert not [w for w in solution.stats.warnings if "too small" in w]
 

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from graphloc.config import AprilTagConfig, load_config
 from graphloc.factors import KINDS
 from graphloc.frames import Array
-from graphloc.frontends._source import Bag
 from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.frontends.source import Bag
 from graphloc.frontends.tags.listed import LISTS, ListedTag, read_list
 from tests.bagfactory import START_NS, Messages, still_run, write_bag
 from tests.tagimages import image, info

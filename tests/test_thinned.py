@@ -12,7 +12,7 @@ from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.graph import Decision
 from graphloc.solve._optimize import bayes_tree, optimize
-from graphloc.solve._stretch import weak_prior
+from graphloc.solve.stretch import weak_prior
 
 
 def problem_of(scenario: Scenario, slow_period_s: float = 1.0) -> tuple[Problem, gtsam.Values]:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess_compass import _beside_either_way
-from graphloc.frontends._turning import Turning, against_turning, course_against_turning, follows_turning, left_of_turns
+from graphloc.frontends.turning import Turning, against_turning, course_against_turning, follows_turning, left_of_turns
 from graphloc.time import NS_PER_S
 
 T_S = np.arange(0.0, 360.0, 0.02)

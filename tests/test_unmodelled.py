@@ -16,11 +16,11 @@ from graphloc.measurements import GnssPosition, Measurement
 from graphloc.online import OnlineSmoother, _waiting
 from graphloc.online._unmodelled import UnmodelledError
 from graphloc.recording import Recording
-from graphloc.series import rms
+from graphloc.signals.series import rms
 from graphloc.solution import Solution
 from graphloc.solve import _solution
-from graphloc.solve._batch import BatchResult
-from graphloc.solve._unmodelled import Unmodelled, unmodelled
+from graphloc.solve.batch import BatchResult
+from graphloc.solve.unmodelled import Unmodelled, unmodelled
 from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
 from tests.faults import arrivals_of, feed, finish

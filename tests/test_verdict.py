@@ -15,11 +15,11 @@ from graphloc.eval.report import ReportData, Trust, durations_s, stretches, verd
 from graphloc.eval.report._health import cure, section
 from graphloc.eval.report._track_verdict import _late_velocity
 from graphloc.eval.simulate import Scenario, simulate
-from graphloc.frozen_receiver import WHY
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import GnssPosition
+from graphloc.signals.frozen_receiver import WHY
 from graphloc.solution import Cause, Health, HealthReason, Solution
-from graphloc.solve._health import health_of
+from graphloc.solve.health import health_of
 from graphloc.trajectory import Trajectory
 
 

@@ -24,7 +24,7 @@ from graphloc.frames import (
 )
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import GnssPosition, PoseFix, PoseMode
-from graphloc.series import integral, interpolated, rms, robust_sigma, runs
+from graphloc.signals.series import integral, interpolated, rms, robust_sigma, runs
 from graphloc.time import NS_PER_S, seconds_between, seconds_since, utc_text
 from graphloc.trajectory import Trajectory
 

@@ -17,7 +17,7 @@ from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.online._entries import Entry
 from graphloc.online._live import LiveStream
 from graphloc.replay import replay
-from graphloc.solve._decide import Verdict
+from graphloc.solve.decide import Verdict
 from tests.slowly import simulate_slowly
 
 SLOW = SlowProcess(

@@ -15,9 +15,9 @@ import numpy as np
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
 from graphloc.eval.calibrate._findings import Check, Suggestion
 from graphloc.eval.formatting import significant
-from graphloc.imu_scatter import FEWEST, noise_density
 from graphloc.measurements import ImuSeries
 from graphloc.offsets import Misfit, Offsets
+from graphloc.signals.imu_scatter import FEWEST, noise_density
 
 _TOO_SMALL, _TOO_LARGE = 1.5, 0.5  # scatter by configured noise
 _LESS = 0.7  # of the configured noise: what the run needs, from which that is too large

@@ -26,7 +26,7 @@ from graphloc.measurements import (
     world_from_fixes,
 )
 from graphloc.recording import Recording
-from graphloc.series import interpolated
+from graphloc.signals.series import interpolated
 from graphloc.time import NS_PER_S
 
 OUTAGES_S = (10.0, 30.0, 60.0, 120.0)

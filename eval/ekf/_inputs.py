@@ -23,7 +23,7 @@ from graphloc.measurements import (
     world_from_fixes,
 )
 from graphloc.recording import Recording
-from graphloc.series import integral, interpolated
+from graphloc.signals.series import integral, interpolated
 from graphloc.survey import Survey
 from graphloc.time import NS_PER_S, seconds_since
 

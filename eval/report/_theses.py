@@ -15,7 +15,7 @@ from graphloc.eval.metrics import compare_to_truth, receiver_errors
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._published import BL_RUNS, DIGERUD_RUNS
 from graphloc.measurements import GnssPosition, PoseFix, TagSighting
-from graphloc.series import rms
+from graphloc.signals.series import rms
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 

@@ -17,9 +17,9 @@ from graphloc.eval.metrics import Table, errors, held_out_errors, receiver_error
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
 from graphloc.frames import Array
-from graphloc.frozen_receiver import FROZEN
 from graphloc.measurements import GnssPosition
-from graphloc.series import rms
+from graphloc.signals.frozen_receiver import FROZEN
+from graphloc.signals.series import rms
 from graphloc.solution import CONTRADICTING_COST, Health, Solution
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory, bounds_95

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array
-from graphloc.series import integral
+from graphloc.signals.series import integral
 
 _STEP_S = 0.02  # knots of the velocity spline
 _WAVES = 12  # sinusoids that stand for a sea

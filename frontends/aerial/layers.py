@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from graphloc.frames import Array
 from graphloc.frontends.aerial.image import Patch, Pixels
 from graphloc.frontends.aerial.vector import VectorMap
-from graphloc.series import robust_sigma
+from graphloc.signals.series import robust_sigma
 
 Layer = NDArray[np.float32]
 Mask = NDArray[np.bool_]

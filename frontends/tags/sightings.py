@@ -18,9 +18,9 @@ from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends._clock import corrected_ns
 from graphloc.frontends._mounts import mounts_of
-from graphloc.frontends._part import Bags
-from graphloc.frontends._source import Bag, RawMessage
 from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
+from graphloc.frontends.part import Bags
+from graphloc.frontends.source import Bag, RawMessage
 from graphloc.frontends.tags.bundles import Seeing, SeenTag, sightings_of
 from graphloc.frontends.tags.camera import CameraModel, camera_of
 from graphloc.frontends.tags.detect import Detector

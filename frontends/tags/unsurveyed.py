@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.frames import Array, rpy_from_rotation, skew
 from graphloc.frontends.tags.pose import poses_of
 from graphloc.measurements import TagSighting, TagView
-from graphloc.series import interpolated
+from graphloc.signals.series import interpolated
 from graphloc.survey import WORLD, DockConfig, Family, Survey, TagConfig
 from graphloc.time import seconds_since, stamps_of
 from graphloc.trajectory import Trajectory

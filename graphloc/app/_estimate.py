@@ -21,16 +21,16 @@ from graphloc.eval.tag_check import suspect_tags
 from graphloc.eval.underlay import underlay
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Datum
-from graphloc.frontends._part import Bags
 from graphloc.frontends.aerial import Match, match_bag
 from graphloc.frontends.bag import read_recording
-from graphloc.frozen_receiver import without_frozen_fixes
+from graphloc.frontends.part import Bags
 from graphloc.gather import Matches, Scans, with_matches, with_sightings, with_surveys
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.offsets import Probe
 from graphloc.online import OnlineSmoother
 from graphloc.recording import Mounts, Progress, Recording, quiet
 from graphloc.replay import Status, replay, silent
+from graphloc.signals.frozen_receiver import without_frozen_fixes
 from graphloc.solution import Solution
 from graphloc.solve import smooth
 from graphloc.time import NS_PER_S

@@ -20,9 +20,9 @@ from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
 from graphloc.graph import InertialLink, InertialRow, Sensor, SlowProcess
 from graphloc.measurements import Measurement
-from graphloc.pauses import common_pauses, pauses_warning
-from graphloc.position_jumps import allowed_jump_m, position_jumps
 from graphloc.recording import Mounts, Recording
+from graphloc.signals.pauses import common_pauses, pauses_warning
+from graphloc.signals.position_jumps import allowed_jump_m, position_jumps
 from graphloc.time import stamps_of, utc_text
 from graphloc.timeline import Timeline, make_timeline
 

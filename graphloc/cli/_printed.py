@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from graphloc.ledger import Ledger, Outcome
-from graphloc.thinning import THINNED
+from graphloc.signals.thinning import THINNED
 
 if TYPE_CHECKING:  # these load gtsam and more, which would delay --help
     from graphloc.app import Run

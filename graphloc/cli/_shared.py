@@ -21,7 +21,7 @@ from graphloc.errors import GraphlocError
 if TYPE_CHECKING:  # these load gtsam and more, which would delay --help
     from graphloc.app import Run, Scans
     from graphloc.config import VesselConfig
-    from graphloc.frontends._part import BagPart
+    from graphloc.frontends.part import BagPart
     from graphloc.recording import Progress, Recording
 
 
@@ -80,7 +80,7 @@ class BagOptions:
     @property
     def part(self) -> BagPart:
         """The bag, or the part of it between --start and --duration."""
-        from graphloc.frontends._part import BagPart
+        from graphloc.frontends.part import BagPart
 
         return BagPart(tuple(self.bag), self.start, self.duration)
 

@@ -14,7 +14,7 @@ from pydantic import Field, field_validator
 
 from graphloc.blocks import Block, Finite, NonNegative, Positive
 from graphloc.config._sensor import KernelConfig, SensorConfig
-from graphloc.thinning import LEAST_APART_NS
+from graphloc.signals.thinning import LEAST_APART_NS
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 

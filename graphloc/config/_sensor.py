@@ -60,7 +60,7 @@ class SensorConfig(Block):
     """What every sensor has."""
 
     apart_ns: ClassVar[int] = 0
-    """Measurements that follow the one before within less tell nothing new, and are left out (`graphloc.thinning`)."""
+    """Measurements that follow the one before within less tell nothing new, and are left out (`graphloc.signals.thinning`)."""
 
     kind: str
     """Which row of the sensor table reads this block."""

@@ -9,10 +9,10 @@ from dataclasses import replace
 from typing import Literal
 
 from graphloc.config import VesselConfig
-from graphloc.frontends._source import Bag
 from graphloc.frontends.aerial.live import LiveMatcher, Matched
 from graphloc.frontends.aerial.scans import ScanFeed
 from graphloc.frontends.aerial.submap import Turn
+from graphloc.frontends.source import Bag
 from graphloc.gather._gathering import Gathering
 from graphloc.gather._matches import Scans
 from graphloc.measurements import Measurement

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from graphloc.config import AerialConfig, VesselConfig
 from graphloc.eval.match_picture import Gallery
 from graphloc.frames import Array, Datum, wrap_angle
-from graphloc.frontends._part import Bags
-from graphloc.frontends._time_offsets import heading_time_offset
-from graphloc.frontends._turning import Turning
 from graphloc.frontends.aerial import match_bag
 from graphloc.frontends.aerial.matcher import NO_POSE
+from graphloc.frontends.part import Bags
+from graphloc.frontends.time_offsets import heading_time_offset
+from graphloc.frontends.turning import Turning
 from graphloc.gather._gathering import Gathering
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution

@@ -13,7 +13,7 @@ import numpy as np
 from graphloc.config import VesselConfig
 from graphloc.errors import ConfigError
 from graphloc.frames import Datum, Geodetic
-from graphloc.frontends._part import Bags
+from graphloc.frontends.part import Bags
 from graphloc.frontends.tags.grid import in_world
 from graphloc.frontends.tags.sightings import camera_info_topic, sightings_of_bag
 from graphloc.frontends.tags.sizes import REFUSED, size_factors

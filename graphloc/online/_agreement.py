@@ -12,9 +12,9 @@ from scipy.special import expit
 from graphloc.graph import Attachment
 from graphloc.measurements import Measurement
 from graphloc.online._live import LiveStream, LiveTimeline
-from graphloc.position_jumps import MEAN_S
-from graphloc.solve._decide import AGREES, CREDIBLE, Verdict, far_sigmas
-from graphloc.solve._health import FAR_OFF
+from graphloc.signals.position_jumps import MEAN_S
+from graphloc.solve.decide import AGREES, CREDIBLE, Verdict, far_sigmas
+from graphloc.solve.health import FAR_OFF
 
 _FEW = 8  # absolute measurements in a row must disagree; fewer are no sign
 # Of disagreement, until the estimate is lost; measurements of one sensor in a row that must disagree.

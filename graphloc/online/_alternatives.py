@@ -19,8 +19,8 @@ from scipy.linalg import block_diag
 from graphloc.build import Judged
 from graphloc.frames import Array
 from graphloc.graph import Residual
-from graphloc.solve._hypotheses import log_false_again, log_right_and_false
-from graphloc.solve._prediction import taken_of
+from graphloc.solve.hypotheses import log_false_again, log_right_and_false
+from graphloc.solve.prediction import taken_of
 
 _MOST, _LEAST = 16, 12.0  # choices that are kept; log probability (nats) below the best at which one is dropped
 # Least eigenvalue of what remains when a measurement is removed, as a share of its own information. Its factor was linearised

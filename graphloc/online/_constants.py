@@ -16,7 +16,7 @@ from graphloc.graph import PLACE, Constant
 from graphloc.online._anchor import Anchor, ConditionalGaussian
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Window
-from graphloc.solve._warnings import FAR_OFF, far_off
+from graphloc.solve.warnings import FAR_OFF, far_off
 
 Number = tuple[str, int]
 """Name of a sensor, and number of one of its constants."""

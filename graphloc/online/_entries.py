@@ -19,8 +19,8 @@ from graphloc.measurements import Measurement
 from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window, keys_of
-from graphloc.solve._decide import NEGLIGIBLE, Verdict, residuals_at
-from graphloc.solve._ledger import row_of
+from graphloc.solve.decide import NEGLIGIBLE, Verdict, residuals_at
+from graphloc.solve.ledger import row_of
 
 _CHANGED = 0.1  # change of a weight from which its factors are replaced
 _MOVED_M, _TURNED_RAD = 0.1, 0.01  # from the pose that a factor was linearised at

@@ -16,13 +16,13 @@ from graphloc.online._odometry import Odometry
 from graphloc.online._propagate import Propagated
 from graphloc.online._unmodelled import UnmodelledError
 from graphloc.solution import Cause
-from graphloc.solve._covariances import (
+from graphloc.solve.covariances import (
     limit_heading,
     unmodelled_covariance,
     widen_heading,
     world_covariance,
 )
-from graphloc.solve._health import health_of, of_receivers
+from graphloc.solve.health import health_of, of_receivers
 from graphloc.time import NS_PER_S
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.solve._wrong_imu import GROWS
+from graphloc.solve.wrong_imu import GROWS
 from graphloc.time import duration_ns
 
 _SENSORS, _FEWEST, _MANY = 2, 2, 5  # that deny; measurements in a row of each, and of one of them at least

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphloc.frozen_imu import WHY, FrozenImuDetector
-from graphloc.imu_spikes import WHY as SPIKE
-from graphloc.imu_spikes import SpikeDetector
 from graphloc.measurements import ImuSample, ImuSeries
+from graphloc.signals.frozen_imu import WHY, FrozenImuDetector
+from graphloc.signals.imu_spikes import WHY as SPIKE
+from graphloc.signals.imu_spikes import SpikeDetector
 from graphloc.time import stamps_of
 
 _BACK = 50  # samples in a row with stamps before the newest: the clock was set back

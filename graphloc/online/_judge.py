@@ -27,9 +27,9 @@ from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._receiver_checks import ReceiverChecks
 from graphloc.online._states import States
 from graphloc.online._window import Window
-from graphloc.solve._best_chain import best_chain
-from graphloc.solve._decide import AGREES, Verdict, believing, by_hypotheses
-from graphloc.solve._hypotheses import log_evidence_of
+from graphloc.solve.best_chain import best_chain
+from graphloc.solve.decide import AGREES, Verdict, believing, by_hypotheses
+from graphloc.solve.hypotheses import log_evidence_of
 
 _REJUDGE_AGES_S = (1.0, 4.0)  # ages at which a measurement with a kernel is judged again
 _OLDER_EVERY_S, _SURE = 1.0, 0.9  # how often an older group is judged again; a weight that needs no second round

@@ -28,12 +28,12 @@ from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import Newest, States
 from graphloc.online._unmodelled import BeforeStart, ErrorSizes, UnmodelledError, estimated_beside
 from graphloc.online._window import Window
-from graphloc.position_jumps import why_in_doubt
-from graphloc.solve._decide import AGREES
-from graphloc.solve._health import why_late, why_unlikely
-from graphloc.solve._imu_noise import log_likelihood
-from graphloc.solve._warnings import noisier_warning
-from graphloc.solve._wrong_imu import most_motion
+from graphloc.signals.position_jumps import why_in_doubt
+from graphloc.solve.decide import AGREES
+from graphloc.solve.health import why_late, why_unlikely
+from graphloc.solve.imu_noise import log_likelihood
+from graphloc.solve.warnings import noisier_warning
+from graphloc.solve.wrong_imu import most_motion
 
 # Of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10.
 _STEP_COST = 1.0

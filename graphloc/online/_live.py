@@ -36,7 +36,7 @@ from graphloc.online._repeated_fix import RepeatedFixDetector
 from graphloc.online._repeated_velocity import RepeatedVelocityDetector
 from graphloc.online._scatter import Scatter
 from graphloc.online._setup import Setup
-from graphloc.position_jumps import JumpDetector, PositionJump
+from graphloc.signals.position_jumps import JumpDetector, PositionJump
 from graphloc.time import NS_PER_S, duration_ns
 
 T = TypeVar("T")

@@ -11,7 +11,7 @@ import numpy as np
 from graphloc.build import noisier_imu
 from graphloc.measurements import ImuSeries
 from graphloc.online._lag import Lag
-from graphloc.solve._imu_noise import CONTRADICTION, LARGEST_NOISE_SCALE, LEAST_TIMES, noise_step, scattered, too_quiet
+from graphloc.solve.imu_noise import CONTRADICTION, LARGEST_NOISE_SCALE, LEAST_TIMES, noise_step, scattered, too_quiet
 
 _EVERY_S, _MISFITS = 5.0, 2  # how often the fit is checked, and how many checks in a row must fail
 _WINDOWS_S = 10.0  # how often a larger noise is tried, where the lag is no longer

@@ -10,7 +10,6 @@ import numpy as np
 
 from graphloc import gauss
 from graphloc.frames import Array
-from graphloc.frozen_receiver import FROZEN, WHY_VELOCITY
 from graphloc.graph import TIME_OFFSET, Attachment, Residual, antenna_off_m, corrections
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
@@ -18,7 +17,14 @@ from graphloc.online._entries import Entries
 from graphloc.online._frozen_receiver import WINDOW_S
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import States
-from graphloc.position_jumps import OffPrediction, allowed_jump_m, jump_warnings, largest_sigma, only_position_sensor
+from graphloc.signals.frozen_receiver import FROZEN, WHY_VELOCITY
+from graphloc.signals.position_jumps import (
+    OffPrediction,
+    allowed_jump_m,
+    jump_warnings,
+    largest_sigma,
+    only_position_sensor,
+)
 from graphloc.time import NS_PER_S
 
 _FITS = 3.0  # sigmas of a fix alone

@@ -16,7 +16,7 @@ from collections import deque
 import numpy as np
 
 from graphloc.frames import Array
-from graphloc.frozen_receiver import (
+from graphloc.signals.frozen_receiver import (
     BEFORE_S,
     FEWEST,
     HELD_S,

@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 
 from graphloc.frames import Array
-from graphloc.frozen_receiver import MANY, MOSTLY, REST_MPS
+from graphloc.signals.frozen_receiver import MANY, MOSTLY, REST_MPS
 
 _RUNS = 20  # velocities after which it is known whether they are rounded
 _KEPT = 200

@@ -10,7 +10,7 @@ import numpy as np
 
 from graphloc.chi2 import chi2_median
 from graphloc.frames import Array
-from graphloc.solve._scatter import GOLDEN, LAGS_S, SPARE, WHITE_S, noisier_than_stated
+from graphloc.solve.scatter import GOLDEN, LAGS_S, SPARE, WHITE_S, noisier_than_stated
 from graphloc.time import NS_PER_S
 
 _REMEMBERED = 300  # residuals, and pairs of them

@@ -10,8 +10,8 @@ from graphloc.config import SensorConfig
 from graphloc.graph import Residual
 from graphloc.measurements import Measurement
 from graphloc.online._lag import Lag
-from graphloc.solve._sensor_noise import Pair, pairs_of, times_stated
-from graphloc.solve._warnings import scale_warning
+from graphloc.solve.sensor_noise import Pair, pairs_of, times_stated
+from graphloc.solve.warnings import scale_warning
 
 _EVERY_S = 5.0
 _SETTLED_S = 1.5  # after so long a measurement has been judged again

@@ -19,9 +19,7 @@ from graphloc.config import VesselConfig
 from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate, Event
 from graphloc.frames import Array, Datum
-from graphloc.frozen_imu import WHY
 from graphloc.graph import InertialRow, Sensor
-from graphloc.imu_spikes import WHY as SPIKE
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement
 from graphloc.online._intake import ImuIntake, series_of
@@ -36,8 +34,10 @@ from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._waiting import Waiting
 from graphloc.origin import refuse_world_without_datum
 from graphloc.recording import Mounts
-from graphloc.solve._warnings import slow_error_warning
-from graphloc.thinning import THINNED, Thinning
+from graphloc.signals.frozen_imu import WHY
+from graphloc.signals.imu_spikes import WHY as SPIKE
+from graphloc.signals.thinning import THINNED, Thinning
+from graphloc.solve.warnings import slow_error_warning
 from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
 

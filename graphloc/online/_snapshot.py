@@ -17,7 +17,7 @@ from graphloc.measurements import ImuSample
 from graphloc.online._anchor import Anchor
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import ErrorSizes
-from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE
+from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE
 
 _VERSION = 9
 _EVERY_S = 2.0

@@ -26,16 +26,16 @@ from graphloc.online._setup import Setup
 from graphloc.online._unmeasured_heading import DOUBTFUL_RAD, UnmeasuredHeading
 from graphloc.online._unmodelled import BeforeStart
 from graphloc.recording import Recording
-from graphloc.solve._align import wanted_travel_m
-from graphloc.solve._batch import BatchResult, solve_batch
-from graphloc.solve._covariances import ANY_HEADING_RAD, world_covariance
-from graphloc.solve._decide import AGREES, decisions
-from graphloc.solve._imu_mount import followed_before
-from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE
-from graphloc.solve._ledger import row_of
-from graphloc.solve._stretch import StretchStep, past_at
-from graphloc.solve._unmodelled import Unmodelled, unmodelled
-from graphloc.solve._warnings import noise_warnings
+from graphloc.solve.alignment import wanted_travel_m
+from graphloc.solve.batch import BatchResult, solve_batch
+from graphloc.solve.covariances import ANY_HEADING_RAD, world_covariance
+from graphloc.solve.decide import AGREES, decisions
+from graphloc.solve.imu_mount import followed_before
+from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE
+from graphloc.solve.ledger import row_of
+from graphloc.solve.stretch import StretchStep, past_at
+from graphloc.solve.unmodelled import Unmodelled, unmodelled
+from graphloc.solve.warnings import noise_warnings
 from graphloc.time import duration_ns
 
 LEAST_S = 5.0  # of IMU data: gives gyro bias, roll and pitch of a vessel in waves

@@ -20,9 +20,9 @@ from graphloc.online._anchor import Anchor, in_world, without_prior
 from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window
-from graphloc.solve._health import FAR_OFF
-from graphloc.solve._prediction import Prediction, prediction_of
-from graphloc.solve._warnings import late_far_off
+from graphloc.solve.health import FAR_OFF
+from graphloc.solve.prediction import Prediction, prediction_of
+from graphloc.solve.warnings import late_far_off
 from graphloc.time import NS_PER_S
 
 _HOLE_S = 1.0  # an IMU gap that the motion model is not applied across

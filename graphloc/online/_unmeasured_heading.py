@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphloc.solve._covariances import ANY_HEADING_RAD
+from graphloc.solve.covariances import ANY_HEADING_RAD
 
 DOUBTFUL_RAD = np.radians(15.0)
 """1 sigma: from a larger error the window does not recover soon, and the heading is a guess."""

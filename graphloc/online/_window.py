@@ -22,7 +22,7 @@ import numpy as np
 from graphloc.errors import SolveError, not_solved
 from graphloc.frames import Array
 from graphloc.keys import is_leaf, is_pose
-from graphloc.solve._linearised import sparse_rows
+from graphloc.solve.linearised import sparse_rows
 
 _RELINEARIZE = 0.02  # of any tangent: m, rad, m/s; the gap to the batch is millimetres
 _NEVER = 1_000_000_000  # updates

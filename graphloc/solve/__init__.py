@@ -17,12 +17,12 @@ from graphloc.graph import InertialRow, Sensor
 from graphloc.offsets import Probe
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
-from graphloc.solve._batch import BatchResult, solve_batch
 from graphloc.solve._memory import give_back_memory
 from graphloc.solve._offsets import offsets_of
 from graphloc.solve._parts import solve_parts
 from graphloc.solve._solution import make_solution
-from graphloc.solve._wrong_imu import ImuWrong, left_out
+from graphloc.solve.batch import BatchResult, solve_batch
+from graphloc.solve.wrong_imu import ImuWrong, left_out
 
 __all__ = ["smooth"]
 

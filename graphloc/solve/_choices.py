@@ -17,7 +17,9 @@ import numpy as np
 
 from graphloc.build import Decisions, Problem, StartPrior, Thinned, build_graph
 from graphloc.graph import Decision
-from graphloc.solve._decide import (
+from graphloc.solve._optimize import bayes_tree
+from graphloc.solve._passes import SETTLED_M, SETTLED_WEIGHT, Settled, changed
+from graphloc.solve.decide import (
     Stage,
     Verdict,
     Verdicts,
@@ -28,9 +30,7 @@ from graphloc.solve._decide import (
     predicted_covariance,
     weigh,
 )
-from graphloc.solve._optimize import bayes_tree
-from graphloc.solve._passes import SETTLED_M, SETTLED_WEIGHT, Settled, changed
-from graphloc.solve._stretch import copy_states, solve_until_written_there, update_states, weak_prior
+from graphloc.solve.stretch import copy_states, solve_until_written_there, update_states, weak_prior
 
 # A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
 # short enough to dead-reckon through.

@@ -23,14 +23,14 @@ from graphloc.chi2 import chi2_95
 from graphloc.frames import Array, wrap_angle
 from graphloc.graph import Attachment, FalseModel, Residual
 from graphloc.measurements import Measurement
-from graphloc.series import interpolated
+from graphloc.signals.series import interpolated
 from graphloc.solution import Graded
-from graphloc.solve._batch import BatchResult
 from graphloc.solve._choices import without
-from graphloc.solve._covariances import world_covariance
-from graphloc.solve._decide import Verdict, decisions_on, met, predicted, predicted_covariance
-from graphloc.solve._hypotheses import log_right_and_false
-from graphloc.solve._prediction import taken_of
+from graphloc.solve.batch import BatchResult
+from graphloc.solve.covariances import world_covariance
+from graphloc.solve.decide import Verdict, decisions_on, met, predicted, predicted_covariance
+from graphloc.solve.hypotheses import log_right_and_false
+from graphloc.solve.prediction import taken_of
 from graphloc.time import stamps_of
 
 _SLIGHT = 0.005  # a probability that widens bounds by 3 % at most

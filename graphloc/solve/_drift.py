@@ -19,8 +19,8 @@ from graphloc import keys
 from graphloc.build import Problem, solved_constants
 from graphloc.frames import Array
 from graphloc.graph import antenna_off_m, corrections
-from graphloc.solve._batch import BatchResult
-from graphloc.solve._linearised import linearised, normal_solver, with_left_out
+from graphloc.solve.batch import BatchResult
+from graphloc.solve.linearised import linearised, normal_solver, with_left_out
 
 _LINEAR_RAD = np.radians(15.0)  # a turn up to which the linearised run holds
 

@@ -11,9 +11,9 @@ import gtsam
 from graphloc.build import Problem, StartPrior, Thinned, thinned, with_sensor_noise
 from graphloc.recording import Progress
 from graphloc.solve._choices import other_choices, take_more_probable
-from graphloc.solve._decide import Stage, Verdicts, weigh
 from graphloc.solve._passes import Settled, cost_without_outliers, expected_cost, settle
-from graphloc.solve._sensor_noise import scattering
+from graphloc.solve.decide import Stage, Verdicts, weigh
+from graphloc.solve.sensor_noise import scattering
 
 MAX_SENSOR_ROUNDS = 2  # that the noise of sensors is raised
 # Before other choices are tried, passes need not converge: what still changes then is a choice that confirms itself.

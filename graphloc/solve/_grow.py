@@ -10,10 +10,10 @@ import numpy as np
 
 from graphloc.build import Past, Problem, StartPrior, without_imu
 from graphloc.recording import Progress
-from graphloc.solve._decide import PredictedCovariance, Stage, Verdicts, agrees, decisions, predicted_covariance, weigh
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import cost_as_configured
-from graphloc.solve._stretch import (
+from graphloc.solve.decide import PredictedCovariance, Stage, Verdicts, agrees, decisions, predicted_covariance, weigh
+from graphloc.solve.stretch import (
     StretchStep,
     copy_states,
     dead_reckon,
@@ -22,7 +22,7 @@ from graphloc.solve._stretch import (
     solve_until_written_there,
     update_states,
 )
-from graphloc.solve._wrong_imu import GrownWindow, ImuWrong, wrong_span
+from graphloc.solve.wrong_imu import GrownWindow, ImuWrong, wrong_span
 
 _CHUNK_S, _OVERLAP_S = 15.0, 5.0
 _SETTLED_M = 0.5

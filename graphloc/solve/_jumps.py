@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from graphloc.build import Problem, jumping
-from graphloc.position_jumps import allowed_jump_m, jumps_off_track
-from graphloc.solve._decide import Verdicts
+from graphloc.signals.position_jumps import allowed_jump_m, jumps_off_track
+from graphloc.solve.decide import Verdicts
 from graphloc.time import stamps_of
 
 

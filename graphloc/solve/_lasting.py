@@ -14,7 +14,7 @@ import numpy as np
 
 from graphloc.build import Stream
 from graphloc.frames import Array
-from graphloc.solve._decide import AGREES, Verdict
+from graphloc.solve.decide import AGREES, Verdict
 from graphloc.time import NS_PER_S, stamps_of
 
 _FEWEST = 30

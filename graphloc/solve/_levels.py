@@ -22,10 +22,10 @@ from graphloc.build import Problem, StartPrior, Stream, build_graph, jumping, st
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
-from graphloc.position_jumps import MEAN_S
 from graphloc.recording import Progress
-from graphloc.solve._decide import Stage, Verdicts, decisions, weigh
+from graphloc.signals.position_jumps import MEAN_S
 from graphloc.solve._passes import Settled, cost_of_run, settle
+from graphloc.solve.decide import Stage, Verdicts, decisions, weigh
 from graphloc.time import NS_PER_S, stamps_of
 
 _JUMP = 1.0  # sigmas from one node to the next: ten times the drift

@@ -29,9 +29,9 @@ from graphloc.build import Problem, StartPrior, Stream, with_imu_turned
 from graphloc.frames import Array
 from graphloc.graph import Constant, SlowProcess
 from graphloc.offsets import Offset, Offsets, Probe
-from graphloc.solve._batch import BatchResult
-from graphloc.solve._imu_noise import imu_misfit
-from graphloc.solve._linearised import Rows, linearised, normal_solver, with_left_out
+from graphloc.solve.batch import BatchResult
+from graphloc.solve.imu_noise import imu_misfit
+from graphloc.solve.linearised import Rows, linearised, normal_solver, with_left_out
 
 BLOCK_S = 2.0
 # Rounds of choosing weights; they end early where the weights, or theta (in sigmas), change little.

@@ -16,10 +16,10 @@ import numpy as np
 from graphloc.build import Problem, Stream
 from graphloc.frames import Array
 from graphloc.ledger import LedgerRow, Outcome
-from graphloc.position_jumps import MEAN_S
-from graphloc.solve._decide import Verdicts, far_sigmas, met
+from graphloc.signals.position_jumps import MEAN_S
 from graphloc.solve._final_passes import RunChoice
 from graphloc.solve._levels import COMES_BACK_OFF, OUTAGE_S
+from graphloc.solve.decide import Verdicts, far_sigmas, met
 from graphloc.time import NS_PER_S, stamps_of, utc_text
 
 _CONVERGES_S = 60.0  # for so long after an outage its fixes are doubted

@@ -10,7 +10,7 @@ import numpy as np
 
 from graphloc.build import Problem
 from graphloc.frames import Array
-from graphloc.series import runs
+from graphloc.signals.series import runs
 from graphloc.time import duration_ns
 
 _STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine running

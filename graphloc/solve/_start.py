@@ -22,10 +22,10 @@ from graphloc.build import Problem, StartPrior
 from graphloc.errors import SolveError
 from graphloc.frames import Array, wrap_angle
 from graphloc.recording import Progress
-from graphloc.solve._align import Start, start_pose
-from graphloc.solve._decide import Stage, cost_of_noise, decisions, weigh
 from graphloc.solve._passes import expected_cost
-from graphloc.solve._stretch import copy_states, dead_reckon, fill_slow, solve_stretch
+from graphloc.solve.alignment import Start, start_pose
+from graphloc.solve.decide import Stage, cost_of_noise, decisions, weigh
+from graphloc.solve.stretch import copy_states, dead_reckon, fill_slow, solve_stretch
 
 # Starts that cost this much more (log-likelihood) are dropped; while several remain, the window grows.
 _COST_APART, _LONGEST_S, _LONGEST_UNTOLD_S = 8.0, 60.0, 600.0

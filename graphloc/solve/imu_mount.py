@@ -29,9 +29,9 @@ from graphloc.build import Problem, StartPrior, with_imu_turned
 from graphloc.errors import SolveError
 from graphloc.frames import Array, skew
 from graphloc.recording import Progress
-from graphloc.solve._decide import Stage, Verdicts, weigh
-from graphloc.solve._linearised import linearised, normal_solver, sparse_rows, with_left_out
 from graphloc.solve._passes import Settled, cost_of_run, settle
+from graphloc.solve.decide import Stage, Verdicts, weigh
+from graphloc.solve.linearised import linearised, normal_solver, sparse_rows, with_left_out
 
 _ROUNDS = 3
 _MATTERS, _TOLD = 0.5, 1.5  # sigmas of the mount, and of what is known of it: less is in the bounds

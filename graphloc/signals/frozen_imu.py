@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array
 from graphloc.measurements import ImuSample
-from graphloc.series import runs
+from graphloc.signals.series import runs
 from graphloc.time import NS_PER_S, utc_text
 
 LEAST_S, FEWEST = 0.2, 10

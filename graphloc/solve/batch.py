@@ -32,18 +32,18 @@ from graphloc.build import Problem, StartPrior, bridged, thinned, with_noise_sca
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.recording import Progress, quiet
-from graphloc.solve._decide import Stage, Verdicts
 from graphloc.solve._final_passes import LAST_PASSES, MAX_SENSOR_ROUNDS, SolvedRun, as_they_scatter
 from graphloc.solve._first_solution import first_solution
-from graphloc.solve._imu_mount import MountError, with_mount_estimated
-from graphloc.solve._imu_noise import CONTRADICTION, noise_step, with_needed_noise
 from graphloc.solve._jumps import jumps_in, with_jumps_of, with_jumps_off_track
 from graphloc.solve._levels import at_usual_level
 from graphloc.solve._optimize import bayes_tree
 from graphloc.solve._passes import cost_of_run, cost_without_outliers, rough_passes
 from graphloc.solve._returns import doubtful_returns
-from graphloc.solve._sensor_noise import scattering
 from graphloc.solve._start import Begun
+from graphloc.solve.decide import Stage, Verdicts
+from graphloc.solve.imu_mount import MountError, with_mount_estimated
+from graphloc.solve.imu_noise import CONTRADICTION, noise_step, with_needed_noise
+from graphloc.solve.sensor_noise import scattering
 
 _MAX_NOISE_ROUNDS, _MAX_JUMP_ROUNDS = 4, 2
 # Nats by which each jump must make a run more probable: which of a thousand fixes it is at and what it leads to, of a hundred places

@@ -21,9 +21,9 @@ from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.ledger import Outcome
 from graphloc.recording import Recording
-from graphloc.solve._decide import agrees, met
 from graphloc.solve._passes import cost_as_configured
-from graphloc.solve._stretch import copy_states, dead_reckon
+from graphloc.solve.decide import agrees, met
+from graphloc.solve.stretch import copy_states, dead_reckon
 from graphloc.time import NS_PER_S, utc_text
 
 WHY = "contradicts the other sensors, which agree with each other"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._turns import without_line
-from graphloc.series import rms
+from graphloc.signals.series import rms
 from graphloc.time import NS_PER_S
 
 # Times over which changes of an angle and of a course are compared: a gyro's bias must be small beside them, and the noise average out.

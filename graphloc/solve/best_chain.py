@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from graphloc.build import Judged
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
-from graphloc.solve._hypotheses import log_false_again
-from graphloc.solve._prediction import Prediction, carried, kept_of, moved, taken_of, walk_of
+from graphloc.solve.hypotheses import log_false_again
+from graphloc.solve.prediction import Prediction, carried, kept_of, moved, taken_of, walk_of
 from graphloc.time import stamps_of
 
 _LOOK_BACK = 64  # candidates for the right one before

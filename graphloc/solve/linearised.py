@@ -18,7 +18,7 @@ from graphloc.build import JUMP, Decided, Made, Problem, StartPrior, Stream, bui
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision
-from graphloc.solve._decide import Verdicts
+from graphloc.solve.decide import Verdicts
 
 _LEAST_WEIGHT = 1e-6
 

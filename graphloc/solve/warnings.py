@@ -14,16 +14,16 @@ from graphloc.build import CONSTANT_TAILS, Problem, Stream, solved_constants
 from graphloc.config import SIGMA_SCALES, PoseConfig, SensorConfig
 from graphloc.frames import Array
 from graphloc.graph import TIME_OFFSET, Constant, SlowProcess, corrections
-from graphloc.position_jumps import jump_warnings, largest_sigma
-from graphloc.series import runs
+from graphloc.signals.position_jumps import jump_warnings, largest_sigma
+from graphloc.signals.series import runs
 from graphloc.solution import CONTRADICTING_COST, Graded, SolveStats
-from graphloc.solve._batch import BatchResult
-from graphloc.solve._decide import AGREES, Verdict
-from graphloc.solve._health import FAR_OFF, late_of
-from graphloc.solve._imu_mount import MountError, mount_sigma_rad
-from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE, too_quiet
 from graphloc.solve._lasting import lasting
 from graphloc.solve._passes import expected_cost
+from graphloc.solve.batch import BatchResult
+from graphloc.solve.decide import AGREES, Verdict
+from graphloc.solve.health import FAR_OFF, late_of
+from graphloc.solve.imu_mount import MountError, mount_sigma_rad
+from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE, too_quiet
 from graphloc.time import NS_PER_S, stamps_of, utc_text
 
 _TURNED, _TOLD = 2.5, 0.1  # sigmas; share of a prior's variance
@@ -184,6 +184,7 @@ def mount_event(problem: Problem) -> tuple[str, ...]:
 
 
 def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
+    """Return costs, iterations and warnings of a solved run."""
     expected = expected_cost(problem, result.verdicts)
     warnings = [*problem.warnings, *_of_the_run(problem, result, expected)]
     there = {stream.number for stream in problem.streams}

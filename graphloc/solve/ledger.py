@@ -9,12 +9,13 @@ from graphloc.build import Judged, Problem
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import Measurement
 from graphloc.recording import Recording
-from graphloc.solve._decide import AGREES, Verdict
+from graphloc.solve.decide import AGREES, Verdict
 
 _FALSE = 0.05  # a hypothesis below this probability is rejected, not just down-weighted
 
 
 def ledger_of(problem: Problem, recording: Recording, verdicts: dict[tuple[int, int], Verdict]) -> Ledger:
+    """Return what became of each message: rows of the recording, of the builder, and one for each verdict."""
     ledger = Ledger(recording.rows)
     for row in problem.rejected:
         if row.seq >= 0:

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.series import robust_sigma
-from graphloc.white_noise import white_noise_of_thirds
+from graphloc.signals.series import robust_sigma
+from graphloc.signals.white_noise import white_noise_of_thirds
 
 _BLOCK = 1000  # samples
 FEWEST = 2 * _BLOCK

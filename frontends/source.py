@@ -24,9 +24,9 @@ from rosbags.rosbag1 import Reader as Reader1
 from graphloc.errors import InputError
 from graphloc.frontends._clock import refuse_set_back
 from graphloc.frontends._open import HINTS, BagOpener, Opened, left_beside, text_of
-from graphloc.frontends._part import BagPart, Bags, recording_times
 from graphloc.frontends._recover import suffix_of
 from graphloc.frontends._types import MessageTypes
+from graphloc.frontends.part import BagPart, Bags, recording_times
 from graphloc.recording import Span
 from graphloc.time import duration_ns, seconds_between, utc_text
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphloc.frames import Array
-from graphloc.series import robust_sigma
+from graphloc.signals.series import robust_sigma
 
 
 def white_noise(columns: Array) -> Array:

@@ -15,11 +15,11 @@ from graphloc import keys
 from graphloc.build import Problem, Stream
 from graphloc.config import VesselConfig
 from graphloc.frames import Array
-from graphloc.position_jumps import LASTS_S, why_in_doubt
+from graphloc.signals.position_jumps import LASTS_S, why_in_doubt
 from graphloc.solution import CONTRADICTING_COST, Cause, Health, HealthReason, SolveStats
-from graphloc.solve._batch import BatchResult
-from graphloc.solve._decide import AGREES, CREDIBLE, Verdict, far_sigmas
-from graphloc.solve._imu_noise import LARGEST_NOISE_SCALE
+from graphloc.solve.batch import BatchResult
+from graphloc.solve.decide import AGREES, CREDIBLE, Verdict, far_sigmas
+from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE
 from graphloc.trajectory import Trajectory, bounds_95
 
 _LOST_BOUND_M, _LOST_HEADING_DEG = 25.0, 45.0  # beyond them a pose helps nobody in a harbour
@@ -97,6 +97,7 @@ def _unlikely(problem: Problem, by_turns: Sequence[Stream], verdicts: dict[tuple
 
 
 def since_agreed(problem: Problem, stream: Stream, verdicts: dict[tuple[int, int], Verdict]) -> Array:
+    """Return (N,) by state how long a sensor has not agreed, s; inf before it first did."""
     agreed = np.array(
         [
             m.stamp_ns
@@ -133,6 +134,11 @@ def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:
 def health_over_time(
     trajectory: Trajectory, since: dict[str, Array], misfits: Sequence[str], good_bound_m: float
 ) -> tuple[tuple[Health, ...], tuple[HealthReason, ...]]:
+    """Return the health of each pose of a track that is solved, and why it is not good: as `health_of`, which knows what comes.
+
+    Args:
+        since: by absolute sensor (N,), s since it last agreed. misfits: by state, what else speaks against it.
+    """
     assert trajectory.cov is not None
     away = {name: _or_until(s, trajectory.stamps_ns) for name, s in since.items()}
     found = [

@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array, Datum
-from graphloc.frozen_imu import stretches
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, GnssVelocity, Measurement, world_from_fixes
 from graphloc.recording import Recording
-from graphloc.series import runs
+from graphloc.signals.frozen_imu import stretches
+from graphloc.signals.series import runs
 from graphloc.time import NS_PER_S, stamps_of
 
 _M = TypeVar("_M", bound=Measurement)

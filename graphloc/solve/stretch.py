@@ -148,10 +148,12 @@ def unwound(problem: Problem, values: gtsam.Values) -> gtsam.Values:
 
 
 def slow_at(problem: Problem, values: gtsam.Values, j: int) -> dict[int, Array]:
+    """Return the slow errors at slow node j, by number of their stream."""
     return {s.number: values.atVector(keys.slow(s.number, j)) for s in problem.streams if s.slow is not None}
 
 
 def fill_slow(problem: Problem, values: gtsam.Values, j: int, bias: Any, slow: dict[int, Array]) -> None:
+    """Set the bias and the slow errors at slow node j: those of `slow`, and 0 of other streams."""
     values.insert_or_assign(keys.bias(j), bias)
     for stream in problem.streams:
         if stream.slow is not None:

@@ -13,9 +13,9 @@ from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion
 from graphloc.frontends._clock import MOST_LATE_S, MOST_ON_ITS_WAY_S
 from graphloc.frontends._mount_yaw import FEWEST, MOVES_M, STEP_S, Felt, bent, windows_of
-from graphloc.frontends._turning import Turning
 from graphloc.frontends._turns import without_line
-from graphloc.series import integral
+from graphloc.frontends.turning import Turning
+from graphloc.signals.series import integral
 from graphloc.time import NS_PER_S
 
 _BLOCK_S = 20.0

@@ -19,7 +19,7 @@ from graphloc.build import Judged, Problem
 from graphloc.frames import Array
 from graphloc.graph import Residual
 from graphloc.measurements import Measurement
-from graphloc.solve._decide import Verdicts
+from graphloc.solve.decide import Verdicts
 
 _PAIRED_S = 10.0  # apart at most: over longer, the error of the estimate changes, too
 _FEWEST, _MOST = 15, 2000  # pairs
