@@ -150,5 +150,5 @@ def test_what_cannot_be_followed_is_taken_back() -> None:
     off_m = np.linalg.norm(track.p_world_m - run.truth.at(track.stamps_ns).p_world_m, axis=1)
     assert off_m.max() < 5.0
     assert any(line == "tags: 100 % of its measurements disagree with the rest" for line in replayed.warnings)
-    (line,) = (line for line in replayed.warnings if "camera camera: by its tags it looks" in line)
-    assert float(line.split("looks ")[1].split()[0]) == pytest.approx(180.0, abs=5.0)
+    (line,) = (line for line in replayed.warnings if "camera camera: by its tags its viewing direction" in line)
+    assert float(line.split("direction is ")[1].split()[0]) == pytest.approx(180.0, abs=5.0)

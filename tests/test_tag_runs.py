@@ -566,10 +566,10 @@ def test_a_camera_whose_mount_is_turned_is_named(sigma_deg: float) -> None:
     used = docked.outcomes().get("used", 0)
     assert used > 0.9 * len(docked.right) if sigma_deg else used < 0.1 * len(docked.right)
     assert ("tags: its camera's mount or clock is estimated" in docked.said) == bool(sigma_deg)
-    (line,) = [text for text in docked.said.split("\n") if "mount says" in text]
+    (line,) = [text for text in docked.said.split("\n") if "off its mount" in text]
     assert "camera camera" in line
     # No better than the heading is, which the compass alone tells: to its deviation.
-    assert float(line.split(" deg elsewhere")[0].split()[-1]) == pytest.approx(90.0, abs=2.0)
+    assert float(line.split(" deg off its mount")[0].split()[-1]) == pytest.approx(90.0, abs=2.0)
     found = [float(a) for a in line.split("rpy_deg [")[1].split("]")[0].split(",")]
     true = docked.truth.rig.cameras["camera"].mount.R_body_sensor
     said = Rotation.from_euler("xyz", found, degrees=True).as_matrix()

@@ -300,7 +300,7 @@ def _lasting_error(stream: Stream, verdicts: Sequence[Verdict]) -> list[str]:
         return []
     said = f"{stream.name}: its errors last for some {found.time_s:.0f} s, by its residuals, and count as independent"
     said += f": set slow_error: {{sigma_m: {found.sigma_m:.2g}, time_constant_s: {found.time_s:.0f}}}, or more; "
-    said += "if its errors are independent, the noise of the sensors between its poses (IMU, wheels) is configured too small"
+    said += "if its errors are independent, the sensors between its poses (IMU, wheels) are noisier than configured"
     return [Graded(said, f"errors of {stream.name} that last", found.sigma_m)]
 
 
