@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a slow GNSS error that nothing tells from motion does to heading and velocity: in their bounds, and not more than that."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -157,6 +158,24 @@ def test_what_a_drift_did_to_the_velocity_is_in_the_bounds_of_a_place_without_fi
     soon, later = np.mean(found, axis=0)
     assert 0.1 < soon < 2.0
     assert 0.3 < later < 2.0
+
+
+@pytest.mark.parametrize("solve", [app.smooth_recording, app.replay_recording], ids=["offline", "online"])
+def test_a_drift_of_the_height_turns_nothing_where_the_height_is_known(solve: Callable[..., app.Run]) -> None:
+    """It was taken to tilt the vessel about its antenna: 0.5 m/s by 5 m, and a bound twice as wide 17 s after the last fix."""
+    run, recording, config = drifting(0, 0.1, compass_hz=5.0, duration_s=30.0)
+    config = with_few_states(config.with_sensors({"height": run.config.sensors["height"]}))
+    end_ns = run.truth.stamps_ns[0] + 15 * NS_PER_S
+    kept = [m for m in recording.measurements if m.sensor != "gnss" or m.stamp_ns < end_ns]
+    recording, variances = replace(recording, measurements=tuple(kept)), []
+    for sigma_m in (0.1, 5.0):
+        gnss = config.sensors["gnss"]
+        slow_error = gnss.slow_error.model_copy(update={"vertical_sigma_m": sigma_m})
+        changed = config.with_sensors({"gnss": gnss.model_copy(update={"slow_error": slow_error})})
+        track = solve(recording, changed).solution.trajectory
+        assert track.cov is not None
+        variances.append(np.diagonal(track.cov, axis1=1, axis2=2)[::5])
+    np.testing.assert_allclose(variances[1], variances[0], rtol=0.05)
 
 
 def with_compass() -> tuple[SimulatedRun, VesselConfig]:

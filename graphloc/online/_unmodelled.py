@@ -33,6 +33,7 @@ from graphloc.motion_model import MotionModel
 from graphloc.online._anchor import in_world, sound
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import Newest, hole_within
+from graphloc.solve.covariances import untold_errors
 from graphloc.solve.unmodelled import Unmodelled
 from graphloc.time import NS_PER_S
 
@@ -91,7 +92,7 @@ class UnmodelledError:
                 size for these streams; None: not known.
         """
         streams = problem.streams
-        left_out = {name: stream.left_out for name, stream in streams.items() if stream.left_out is not None}
+        left_out = untold_errors(list(streams.values()))
         mount_sigma_rad = problem.imu_mount_sigma_rad
         if not left_out and mount_sigma_rad == 0.0:
             return None

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from graphloc.frames import Array, skew
+from graphloc.graph import SlowProcess
 
 ANY_HEADING_RAD = float(np.pi / np.sqrt(3.0))
 """1 sigma of a heading of which nothing is known."""
@@ -57,12 +59,18 @@ def widen_heading(cov: Array, heading_var: Array | float) -> None:
     cov[..., 5, 5] += more
 
 
+def untold_errors(streams: Sequence[Any]) -> dict[str, SlowProcess]:
+    """Return the slow errors (east, north, up) that nothing can tell from motion, by sensor.
+
+    Without that of the height where the height is known otherwise: fixes that contradict it lose their weight, and turn nothing. Where
+    it was taken from the fixes, it is as far off as they are.
+    """
+    known = any(s.row.synthetic is not None and s.config.height_m is not None for s in streams)
+    told = np.array([1.0, 1.0, 0.0 if known else 1.0])
+    left_out = {stream.name: stream.left_out for stream in streams if stream.left_out is not None}
+    return {name: replace(slow, sigma=slow.sigma * told) for name, slow in left_out.items()}
+
+
 def unmodelled_covariance(streams: Sequence[Any]) -> Array:
     """Return the covariance (3, 3) of slow errors that nothing can tell from motion: the position is off by as much."""
-    total = np.zeros((3, 3))
-    for stream in streams:
-        if stream.left_out is not None:
-            total += np.diag(stream.left_out.sigma**2)
-    if any(s.row.synthetic is not None and s.config.height_m is not None for s in streams):
-        total[2, 2] = 0.0  # the height is known otherwise; taken from the fixes, it is as far off as they are
-    return total
+    return sum((np.diag(slow.sigma**2) for slow in untold_errors(streams).values()), np.zeros((3, 3)))

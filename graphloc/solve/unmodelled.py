@@ -20,6 +20,7 @@ from graphloc.build import Stream
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
 from graphloc.solve.batch import BatchResult
+from graphloc.solve.covariances import untold_errors
 from graphloc.solve.linearised import linearised, normal_solver
 from graphloc.time import NS_PER_S
 
@@ -43,9 +44,10 @@ def unmodelled(result: BatchResult) -> Unmodelled | None:
     if all(stream.left_out is None for stream in problem.streams):
         return None
     rows = linearised(problem, values, result.verdicts, result.prior)
+    untold = untold_errors(problem.streams)
     followed = [
-        (stream.left_out, stream, used) for stream in problem.streams
-        if stream.left_out is not None and (used := rows.used(stream))  # else all its fixes were rejected
+        (untold[stream.name], stream, used) for stream in problem.streams
+        if stream.name in untold and (used := rows.used(stream))  # else all its fixes were rejected
     ]  # fmt: skip
     root, J, _ = rows.weighed()
     solve, rng, n = normal_solver(J), np.random.default_rng(0), rows.states
