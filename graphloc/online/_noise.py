@@ -74,7 +74,7 @@ class ImuNoise:
         return f"the IMU contradicts the other sensors: its noise is scaled up to {self.scale:.1f} times"
 
     def _too_quiet(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
-        """Raise the noise to what the samples scatter, where that makes what was measured more probable (see `solve._imu_noise`).
+        """Raise the noise to what the samples scatter, where that makes what was measured more probable (see `solve.imu_noise`).
 
         Not by the IMU's residuals alone, as offline: in a window of seconds, the prior of the data before it takes up most of a misfit.
         """

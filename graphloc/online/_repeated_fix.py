@@ -6,7 +6,7 @@ fixes before, and still be by the estimate; or, in hindsight, the position jumps
 vessel that has braked from v keeps 2 v sin(a / 2) in the estimate, but only v (1 - cos a) along v: what counts is the velocity along
 the fastest just before, and by the last of the fixes before the vessel must not have been much slower. None of this is asked of a
 receiver that has scattered at rest. One whose frozen position scatters by more: `_frozen_receiver.py`. Offline:
-`graphloc/frozen_receiver.py`.
+`graphloc/signals/frozen_receiver.py`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A receiver, or its driver, that repeats a velocity bit for bit: it hangs. Offline: `graphloc/frozen_receiver.py`."""
+"""A receiver, or its driver, that repeats a velocity bit for bit: it hangs. Offline: `graphloc/signals/frozen_receiver.py`."""
 
 from __future__ import annotations
 

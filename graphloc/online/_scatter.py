@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""By what factor a sensor's residuals scatter more than it states, as they arrive (offline: `solve/_scatter.py`)."""
+"""By what factor a sensor's residuals scatter more than it states, as they arrive (offline: `solve/scatter.py`)."""
 
 from __future__ import annotations
 

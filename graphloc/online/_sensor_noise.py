@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of fixes, poses and matches that scatter more from one to the next than they state (offline: `solve/_sensor_noise.py`)."""
+"""Noise of fixes, poses and matches that scatter more from one to the next than they state (offline: `solve/sensor_noise.py`)."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ the body; so that becomes (1 - P+ J) F (e + U m) + P+ J U+ m, which is linear in
 The state has the slow errors of the other sensors with it: a compass whose mount offset is unknown holds a heading for a while,
 but does not tell it. P is computed here, not taken from the window: that is linearised anew now and then, and judges older
 measurements again, which its covariances of two states do not tell from what was measured between them. Offline:
-`graphloc.solve.unmodelled`, `_imu_mount`, where m is estimated, too. Where the window has the motion model (`graphloc.motion_model`),
+`graphloc.solve.unmodelled`, `graphloc.solve.imu_mount`, where m is estimated, too. Where the window has the motion model (`graphloc.motion_model`),
 F and Q have it, without its kernel. Not handled: what comes late counts as measured at the newest state.
 """
 

@@ -50,7 +50,7 @@ class SolvedRun(NamedTuple):
 def as_they_scatter(
     problem: Problem, few: Thinned, estimate: gtsam.Values, prior: StartPrior, progress: Progress
 ) -> SolvedRun:
-    """Make the final passes, again with larger sigmas of the sensors that scatter more than they state (see `_sensor_noise`)."""
+    """Make the final passes, again with larger sigmas of the sensors that scatter more than they state (see `sensor_noise`)."""
     settled, passes, iterations = _final_passes(problem, few, estimate, prior, progress), 0, 0
     for _ in range(MAX_SENSOR_ROUNDS):
         times = scattering(problem, settled.verdicts)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The offline solver: align, grow, then decide over the whole run.
 
-1. Align over a window; try each candidate heading on it and keep the cheapest (`_align`, `_start`).
+1. Align over a window; try each candidate heading on it and keep the cheapest (`alignment`, `_start`).
 2. Grow by some seconds at a time, each window solved with a prior from earlier data. Hypotheses that are
    new in a window are judged by the prediction without them, with its covariance (`_grow`). Both on a
    thinned run (`graphloc.build.thinned`). Passes over all of it remove the seams: there they cost a fifth.
 3. Passes over the whole run: modes and weights re-chosen until they no longer change (`_passes`).
 4. Try other choices that may be more probable (`_choices`), and repeat 3 where there are any. Where that shows position
    jumps of the only position sensor, 1 to 4 are repeated with them (`_jumps`); where the first fixes after an outage bend the track,
-   without these (`_returns`). Where the IMU's mount is clearly off, repeat 3 with it turned (`_imu_mount`).
+   without these (`_returns`). Where the IMU's mount is clearly off, repeat 3 with it turned (`imu_mount`).
 5. Where receivers jump and no other sensor measures position, choose the most probable level (`_levels`).
 6. A Bayes tree of the last graph gives the covariances of every state.
 
@@ -74,7 +74,7 @@ class BatchResult:
     heading_var: Array  # (N,) rad^2 of each state, by headings that the motion does not exclude (see `_start`)
     begun: int  # last state of the first window: what comes later is not in `heading_var`
     levels_cov: Array  # (N, 3, 3) of the positions, m^2, by other levels that may be the usual ones (see `_levels`)
-    mount: MountError | None  # what is known of that of the IMU (see `_imu_mount`); None: not reckoned for this graph
+    mount: MountError | None  # what is known of that of the IMU (see `imu_mount`); None: not reckoned for this graph
     notes: tuple[str, ...]
 
     def lightened(self) -> BatchResult:
