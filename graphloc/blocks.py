@@ -72,7 +72,7 @@ class MountConfig(Block):
     @classmethod
     def of_pose(cls, t_body_sensor_m: Array, R_body_sensor: Array) -> MountConfig:
         """Return it in numbers, as it is in no /tf_static."""
-        xyz_m, rpy_deg = t_body_sensor_m, np.degrees(rpy_from_rotation(R_body_sensor)) + 0.0  # no -0.0
+        xyz_m, rpy_deg = t_body_sensor_m, np.round(np.degrees(rpy_from_rotation(R_body_sensor)), 9) + 0.0  # no -0.0
         return cls(xyz_m=tuple(xyz_m.tolist()), rpy_deg=tuple(rpy_deg.tolist()))
 
 

@@ -66,12 +66,12 @@ def test_the_effective_configuration_has_mounts_in_numbers(tmp_path: Path) -> No
     mount = load_config(page.parent / "vessel.effective.yaml", KINDS).sensors["gnss"].mount
     assert mount.tf_frame is None
     np.testing.assert_allclose(mount.t_body_sensor_m, LEVER_M, atol=1e-12)
-    np.testing.assert_allclose(mount.R_body_sensor, TURN, atol=1e-12)
+    assert mount.rpy_deg == (180.0, 0.0, 92.0)
 
 
-def test_a_name_that_no_sensor_has_is_said_once() -> None:
+def test_a_name_that_no_sensor_has_is_said_once(tmp_path: Path) -> None:
     run = simulated()
-    online = graphloc.online_smoother(run.config)
+    online = graphloc.online_smoother(run.config, snapshot=str(tmp_path / "now.json"))
     for m in run.recording.of(graphloc.GnssPosition):
         online.feed(replace(m, sensor="gnns"))
     assert [e.text for e in online.events()] == [

@@ -70,7 +70,7 @@ def online_smoother(
     mounts: Mounts = MappingProxyType({}),
     datum: Datum | None = None,
     lag_s: float = 10.0,
-    snapshot: Path | None = None,
+    snapshot: Path | str | None = None,
 ) -> OnlineSmoother:
     """Return the online mode for all kinds of sensors that graphloc knows.
 
@@ -80,8 +80,9 @@ def online_smoother(
     Raises:
         InputError: a mount is missing, or the origin of something that is given in world.
     """
+    path = None if snapshot is None else Path(snapshot)
     return OnlineSmoother(
-        config, rows=SENSORS, inertial=INERTIAL, mounts=mounts, datum=datum, lag_s=lag_s, snapshot=snapshot
+        config, rows=SENSORS, inertial=INERTIAL, mounts=mounts, datum=datum, lag_s=lag_s, snapshot=path
     )
 
 

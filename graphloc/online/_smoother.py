@@ -44,6 +44,7 @@ from graphloc.trajectory import Trajectory
 log = logging.getLogger(__name__)
 _AGAIN_S = 6.0  # of data, with which a lost estimate starts anew
 _AHEAD_S = 60.0  # of the IMU: a stamp of another clock
+_MOST_NAMES = 100  # of sensors that are not configured: each is said once
 _NOT_REACHED = "the estimate restarted before IMU data reached its stamp"
 _NOT_ASKED = "its sensor is switched off or not in the configuration"
 
@@ -202,7 +203,8 @@ class OnlineSmoother:
 
     def _ignore(self, m: Measurement, why: str) -> None:
         self._ledger.drop(m, Outcome.IGNORED, why)
-        if m.sensor not in self._setup.config.sensors and m.sensor not in self._ignored:  # misspelt?
+        said = m.sensor in self._ignored or len(self._ignored) >= _MOST_NAMES
+        if m.sensor not in self._setup.config.sensors and not said:  # misspelt?
             self._ignored.add(m.sensor)
             self._say(f"{m.sensor}: its messages are ignored: no sensor has this name in the configuration")
 
