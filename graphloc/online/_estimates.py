@@ -18,7 +18,6 @@ from graphloc.online._unmodelled import UnmodelledError
 from graphloc.solution import Cause
 from graphloc.solve.covariances import (
     limit_heading,
-    unmodelled_covariance,
     widen_heading,
     world_covariance,
 )
@@ -90,10 +89,10 @@ def _covariances(now: Propagated, lag: Lag, R: Array, unmodelled: UnmodelledErro
     Args:
         R: (3, 3) attitude. unmodelled: as of `estimate_of`.
     """
-    lever, streams = -lag.problem.t_body_imu_m, list(lag.problem.streams.values())
+    lever = -lag.problem.t_body_imu_m
     cov, v_cov = world_covariance(sound(now.pose_cov), R, lever), now.velocity_cov
     if unmodelled is not None:  # else there is nothing of that
         ahead_s = (now.stamp_ns - unmodelled.newest.stamp_ns) / NS_PER_S
-        cov += unmodelled.pose(R @ lever, unmodelled_covariance(streams), ahead_s)
+        cov += unmodelled.pose(R @ lever, ahead_s)
         v_cov = v_cov + unmodelled.velocity
     return cov, v_cov

@@ -174,13 +174,14 @@ class UnmodelledError:
             raise ArithmeticError("what slow errors do to the newest state is not finite")
         self.newest, self.P, self.cov, self.by_mount = newest, P, 0.5 * (cov + cov.T), by_mount
 
-    def pose(self, lever_m: Array, standing: Array, ahead_s: float = 0.0) -> Array:
+    def pose(self, lever_m: Array, ahead_s: float = 0.0) -> Array:
         """Return the covariance (6, 6) that comes on top of that of the place of a point of the body, and of the attitude, in axes of world.
 
+        The place is off by the standing size of the left-out errors at least. A height that is taken from the fixes once is, too, though
+        here it counts as measured.
+
         Args:
-            lever_m: (3,) the point from the IMU, axes of world. standing: (3, 3), m^2, of the left-out errors: the place is off by that at
-                least. A height that is taken from the fixes once is, too, though here it counts as measured.
-            ahead_s: for how long the newest state is propagated by the IMU.
+            lever_m: (3,) the point from the IMU, axes of world. ahead_s: for how long the newest state is propagated by the IMU.
         """
         of_point = np.zeros((6, 9))
         of_point[:3, _ROTATION], of_point[:3, _POSITION], of_point[:3, _VELOCITY] = (
@@ -190,7 +191,8 @@ class UnmodelledError:
         )
         of_point[3:, _ROTATION] = np.eye(3)
         cov = of_point @ self.cov[:9, :9] @ of_point.T
-        cov[:3, :3] += np.diag(np.maximum(np.diagonal(standing) - np.diagonal(cov)[:3], 0.0))
+        standing = sum((slow.sigma**2 for slow in self.left_out.values()), np.zeros(3))
+        cov[:3, :3] += np.diag(np.maximum(standing - np.diagonal(cov)[:3], 0.0))
         turned = self.by_mount[_ROTATION] - self.newest.pose.rotation().matrix()
         by = np.vstack([self.by_mount[_POSITION] - skew(lever_m) @ turned, turned])
         return np.asarray(cov + self.mount_sigma_rad**2 * by @ by.T)
