@@ -12,6 +12,7 @@ solution is moved to the body's origin at the end (`graphloc.solve`).
 
 from graphloc.build._attach import (
     Carry,
+    Estimates,
     Judged,
     Sited,
     asks_for_delay,
@@ -77,6 +78,7 @@ __all__ = [
     "Carry",
     "Decided",
     "Decisions",
+    "Estimates",
     "Judged",
     "Level",
     "Made",

@@ -71,6 +71,26 @@ class Sited(Protocol):
         ...
 
 
+class Estimates(Protocol):
+    """What `attach` needs to know of the values of states (`gtsam.Values`, or those of a window)."""
+
+    def exists(self, j: int, /) -> bool:
+        """Whether there is a key."""
+        ...
+
+    def atPose3(self, j: int, /) -> Any:
+        """Return a pose."""
+        ...
+
+    def atVector(self, j: int, /) -> Any:
+        """Return a vector."""
+        ...
+
+    def atConstantBias(self, j: int, /) -> Any:
+        """Return a bias of the IMU."""
+        ...
+
+
 class Attaching(Protocol):
     """What `attach` needs to know of a stream (`Stream`, or a live one)."""
 
@@ -149,7 +169,7 @@ class Judged(Attaching, Protocol):
         ...
 
 
-def nav_state(values: gtsam.Values, k: int) -> Any:
+def nav_state(values: Estimates, k: int) -> Any:
     """Return the NavState of state k."""
     return gtsam.NavState(values.atPose3(keys.pose(k)), values.atVector(keys.velocity(k)))
 
@@ -165,7 +185,7 @@ def state_of(m: Measurement, floor: int, nearest: int, stamps_ns: Stamps, holes:
     return floor if in_hole else nearest
 
 
-def attach(problem: Sited, stream: Attaching, i: int, values: gtsam.Values) -> Attachment:
+def attach(problem: Sited, stream: Attaching, i: int, values: Estimates) -> Attachment:
     """Return the attachment of measurement `i` of a stream at the current estimate."""
     k = int(stream.state[i])
     j = int(problem.timeline.slow_of[k])
@@ -221,7 +241,7 @@ def _slow_walk(problem: Sited, stream: Attaching, i: int) -> Array | None:
 
 
 def _next_slow(
-    problem: Sited, stream: Attaching, j: int, stamp_ns: int, values: gtsam.Values
+    problem: Sited, stream: Attaching, j: int, stamp_ns: int, values: Estimates
 ) -> tuple[int, Array, float, float] | None:
     stamps, key = problem.timeline.slow_stamps_ns, keys.slow(stream.number, j + 1)
     if j + 1 >= len(stamps) or not values.exists(key):
@@ -231,7 +251,7 @@ def _next_slow(
     return key, values.atVector(key), share, apart * 1e-9
 
 
-def constants_of(stream: Attaching, values: gtsam.Values) -> tuple[tuple[int, Array], ...]:
+def constants_of(stream: Attaching, values: Estimates) -> tuple[tuple[int, Array], ...]:
     """Return keys and estimates of a sensor's constants; zero for those that no factor has yet."""
     if not stream.constants:
         return ()

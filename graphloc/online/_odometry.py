@@ -8,8 +8,8 @@ gyroscope alone they would.
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array
 
@@ -63,7 +63,9 @@ class Odometry:
         lean = np.array([up[1], -up[0], 0.0]) * min(dt_s / _LEAN_S, 1.0)
         size = float(np.linalg.norm(lean))
         lean *= min(1.0, _LEAN_RAD / size) if size > 0.0 else 1.0
-        self.R = np.asarray(Rotation.from_rotvec(lean).as_matrix() @ R)
-        self.R = np.asarray(Rotation.from_matrix(self.R).as_matrix())  # a rotation still, after a day of steps
+        R = gtsam.Rot3.Expmap(lean).matrix() @ R
+        self.R = R @ (
+            1.5 * np.eye(3) - 0.5 * R.T @ R
+        )  # a rotation still, after a day of steps: Newton's step to the nearest one
         cov[3:, 3:] += size**2 * 0.1 * np.eye(3)
         self.stamp_ns, self.step_cov = until_ns, self.step_cov + cov

@@ -42,19 +42,54 @@ class Held:
     slots: list[int] = field(default_factory=list)
 
 
+class LazyEstimates:
+    """Values of the keys of a window, as of its last commit, and the guess of those staged since.
+
+    Each is computed when it is asked for: nine of ten, of leaves and older states, never are.
+    """
+
+    def __init__(self, solver: gtsam.ISAM2, staged: gtsam.Values) -> None:
+        self._solver, self._staged = solver, staged
+        self._whole: gtsam.Values | None = None
+
+    def exists(self, key: int) -> bool:
+        """Whether a key is in the window, or staged."""
+        return bool(self._solver.valueExists(key) or self._staged.exists(key))
+
+    def atPose3(self, key: int) -> Any:
+        """Return a pose, by the name that it has in `gtsam.Values`; so do the others."""
+        known = self._solver.valueExists(key)
+        return self._solver.calculateEstimatePose3(key) if known else self._staged.atPose3(key)
+
+    def atVector(self, key: int) -> Array:
+        """Return a vector."""
+        known = self._solver.valueExists(key)
+        return np.asarray(self._solver.calculateEstimateVector(key) if known else self._staged.atVector(key))
+
+    def atConstantBias(self, key: int) -> Any:
+        """Return a bias of the IMU."""
+        known = self._solver.valueExists(key)
+        return self._solver.calculateEstimateConstantBias(key) if known else self._staged.atConstantBias(key)
+
+    def whole(self) -> gtsam.Values:
+        """Return the values of all keys of the last commit."""
+        if self._whole is None:
+            self._whole = self._solver.calculateEstimate()
+        return self._whole
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Mark:
     """A copy of all that a commit changes, to restore a window with nothing staged."""
 
     solver: gtsam.ISAM2
-    values: gtsam.Values
     linearised: gtsam.Values
     alive: dict[int, float]
     newest: set[int]
 
 
 class Window:
-    """A fixed-lag smoother. `values` holds the estimate of every key in it, and the guess of staged keys."""
+    """A fixed-lag smoother. `values` tells the estimate of every key in it, and the guess of staged keys."""
 
     def __init__(self, lag_s: float) -> None:
         params = gtsam.ISAM2Params()
@@ -65,7 +100,6 @@ class Window:
         params.setRelinearizeThreshold(_RELINEARIZE)
         self.lag_s = lag_s
         self._solver = gtsam.ISAM2(params)
-        self.values = gtsam.Values()
         self._alive: dict[int, float] = {}  # keys in the solver, and the time (s) when each was last touched
         self._newest: set[int] = set()  # keys of the last commit
         self._linearised = gtsam.Values()  # linearisation point of each key in the solver
@@ -73,6 +107,7 @@ class Window:
 
     def _clear(self) -> None:
         self._graph, self._guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self.values = LazyEstimates(self._solver, self._guess)
         self._stamps: dict[int, float] = {}
         self._remove: list[int] = []
         self._bare: set[int] = set()  # keys whose factors are all removed: the solver forgets them
@@ -82,7 +117,6 @@ class Window:
     def guess(self, key: int, value: Any, t_s: float) -> None:
         """Stage a new key."""
         self._guess.insert(key, value)
-        self.values.insert(key, value)
         self._linearised.insert_or_assign(key, value)
         self._stamps[key] = t_s
 
@@ -161,13 +195,13 @@ class Window:
             slots = list(self._solver.update(self._graph, self._guess, params).getNewFactorsIndices())
             if gone:
                 self._solver.marginalizeLeaves(_listed(gone))
-            self.values = self._solver.calculateEstimate()
+            for key in gone:
+                del alive[key]
+            self._solver.calculateEstimatePose3(next(filter(is_pose, alive)))  # solves for all keys: it may fail
             if gone or self._to_relinearise:
                 self._linearised = gtsam.Values(self._solver.getLinearizationPoint())
         for held in self._added:
             held.slots, slots = slots[: held.count], slots[held.count :]
-        for key in gone:
-            del alive[key]
         self._alive = alive
         self._clear()
 
@@ -194,7 +228,6 @@ class Window:
         assert not self._remove
         return Mark(
             gtsam.ISAM2(self._solver),
-            gtsam.Values(self.values),
             gtsam.Values(self._linearised),
             dict(self._alive),
             set(self._newest),
@@ -206,7 +239,7 @@ class Window:
         Args:
             held: factors that may have been removed since, and their slots then.
         """
-        self._solver, self.values, self._linearised = mark.solver, mark.values, mark.linearised
+        self._solver, self._linearised = mark.solver, mark.linearised
         self._alive, self._newest = mark.alive, mark.newest
         self._clear()
         for factors, slots in held:
@@ -240,7 +273,7 @@ class Window:
     def error(self, without: Iterable[Held] = ()) -> float:
         """Return the cost of the graph at the estimate (half the weighted squares), without that of some factors."""
         graph = self._solver.getFactorsUnsafe()
-        return float(graph.error(self.values)) - self._bent(graph) - sum(self.errors_of(without))
+        return float(graph.error(self.values.whole())) - self._bent(graph) - sum(self.errors_of(without))
 
     def _bent(self, graph: gtsam.NonlinearFactorGraph) -> float:
         """Return how much the factors at the oldest poses cost beyond their cost in the solver, which cannot relinearise these poses.
@@ -259,12 +292,13 @@ class Window:
             for f in steps
             if isinstance(f, gtsam.NoiseModelFactor) and not isinstance(f.noiseModel(), gtsam.noiseModel.Robust)
         ]
-        return float(sum(f.error(self.values) - f.linearize(point).error(step) for f in bent))
+        values = self.values.whole()
+        return float(sum(f.error(values) - f.linearize(point).error(step) for f in bent))
 
     def errors_of(self, parts: Iterable[Held]) -> list[float]:
         """Return the cost of committed factors, of each `Held` together."""
-        factors = self._solver.getFactorsUnsafe()
-        return [float(sum(factors.at(slot).error(self.values) for slot in held.slots)) for held in parts]
+        factors, values = self._solver.getFactorsUnsafe(), self.values.whole()
+        return [float(sum(factors.at(slot).error(values) for slot in held.slots)) for held in parts]
 
     def linear(self, first: Iterable[Held]) -> tuple[Any, Array]:
         """Return J (rows, columns) and b (rows,) of all factors in whitened rows, linearised at the estimate; those of `first` come first."""
@@ -275,7 +309,7 @@ class Window:
         for slot in (*begin, *sorted(rest)):
             if (factor := factors.at(slot)) is not None:
                 graph.add(factor)
-        return sparse_rows(graph, self.values)
+        return sparse_rows(graph, self.values.whole())
 
     def is_committed(self, key: int) -> bool:
         return key in self._alive

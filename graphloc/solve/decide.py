@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from graphloc import keys
-from graphloc.build import Decided, Decisions, Judged, Problem, Sited, Stream, Thinned, attach
+from graphloc.build import Decided, Decisions, Estimates, Judged, Problem, Sited, Stream, Thinned, attach
 from graphloc.chi2 import chi2_95
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
@@ -154,9 +154,7 @@ def weigh(
     return verdicts
 
 
-def residuals_at(
-    problem: Sited, stream: Judged, i: int, values: gtsam.Values
-) -> tuple[Attachment, tuple[Residual, ...]]:
+def residuals_at(problem: Sited, stream: Judged, i: int, values: Estimates) -> tuple[Attachment, tuple[Residual, ...]]:
     """Return the attachment of a measurement at the present estimate, and its residuals there, one per mode."""
     at = attach(problem, stream, i, values)
     return at, stream.row.residuals(stream.measurements[i], stream.config, at)
