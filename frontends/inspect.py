@@ -507,8 +507,10 @@ def _lacking(
     lines = []
     if not any(not imu.missing for imu in imus):
         lines.append("no whole IMU in it: smooth, replay and compare need one (sensor_msgs/Imu, 50 Hz or more)")
-    if not (gnss or bag.lidars or bag.cameras or any(report.role == "pose" or report.grid for report in odometry)):
-        lines.append("nothing in it tells the place: no GNSS fix that can be used, no pose")
+    if not (gnss or bag.cameras or any(report.role == "pose" or report.grid for report in odometry)):
+        around = " (scans are matched around a track, which they cannot begin)" if bag.lidars else ""
+        said = "nothing in it tells the place: no GNSS fix that can be used, no pose, no camera for tags"
+        lines.append(f"{said}; smooth, replay and compare need one: record it, too{around}")
     read = {name.partition(" ")[0] for name in bag.streams}  # of NMEA a stream is a sentence
     others = [
         t
