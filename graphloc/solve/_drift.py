@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the drift of the only position sensor did to heading and velocity, taken back.
+"""What the drift of the only position sensor did to heading and velocity, and to the place where no fixes come, taken back.
 
 Its slow error is left out of the graph (`Stream.left_out`), so fixes count as if their errors were white: hundreds of them a minute
 overrule a compass by six of its sigmas, where the drift that bends their track is the likelier reason. With the error as states
@@ -27,9 +27,9 @@ _LINEAR_RAD = np.radians(15.0)  # a turn up to which the linearised run holds
 
 
 def with_drift_taken_back(result: BatchResult) -> BatchResult:
-    """Return the result with heading, velocity and slow states as they are where the left-out slow error is a state; covariances as they are.
+    """Return the result with heading, velocity, slow states and, where no fixes come, the place as with the left-out slow error as a state.
 
-    Nothing changes where no error is left out, or where the heading would turn by more than the linearised run can tell.
+    Covariances stay as they are. Nothing changes where no error is left out, or where the heading would turn by more than the linearised run can tell.
 
     Raises:
         RuntimeError: a state is not determined.
