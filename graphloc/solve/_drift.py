@@ -27,9 +27,10 @@ _LINEAR_RAD = np.radians(15.0)  # a turn up to which the linearised run holds
 
 
 def with_drift_taken_back(result: BatchResult) -> BatchResult:
-    """Return the result with heading, velocity, slow states and, where no fixes come, the place as with the left-out slow error as a state.
+    """Return the result with heading, velocity, slow states and, where no fixes come, place as they are where the left-out error is a state.
 
-    Covariances stay as they are. Nothing changes where no error is left out, or where the heading would turn by more than the linearised run can tell.
+    Covariances stay as they are. Nothing changes where no error is left out, or where the heading would turn by more than the linearised
+    run can tell.
 
     Raises:
         RuntimeError: a state is not determined.
