@@ -39,6 +39,9 @@ GAIN_LIMIT_S = 0.1
 FEWEST_STAMPS = 100
 """Messages that tell what their clock gains."""
 
+_WHOLE_S = 0.1  # by which a leap of whole seconds may seem off, as messages take longer or shorter
+_BESIDE, _FEWEST_BESIDE = 20, 10  # messages to either side that tell a leap
+_SOONER = 0.75  # of these: others were delayed
 _TENTHS = 10  # of a run
 _EVEN = 0.15  # of the gain, that a clock may be off an even one
 _MOST_DRIFT = 0.1  # of time: beyond, it is none, and the configuration takes none
@@ -105,11 +108,16 @@ class ClockStep(NamedTuple):
 
     def said(self, whose: str) -> str:
         """Return it in words, with what to do."""
+        said = self.what(whose)
+        return f"{said}: no time_offset_s holds on both sides, and no bound includes it; take one side (--start, --duration)"
+
+    def what(self, whose: str) -> str:
+        """Return it in words."""
         way = "forward" if self.by_s > 0.0 else "back"
         said = f"the clock of {whose} was set {way} by {abs(self.by_s):.2f} s at {utc_text(self.at_ns)}, recording time"
         if abs(abs(self.by_s) - GPS_AHEAD_S) < LEAP_S:
             said += f", as from {'UTC to GPS time' if self.by_s > 0.0 else 'GPS time to UTC'}"
-        return f"{said}: no time_offset_s holds on both sides, and no bound includes it; take one side (--start, --duration)"
+        return said
 
     @property
     def when(self) -> str:
@@ -144,6 +152,48 @@ def step(stamps_ns: Stamps, logs_ns: Stamps, least_s: float = EPOCH_LIMIT_S) -> 
     off_s = np.abs(ahead_s - np.where(np.arange(len(later)) < first, before_s, after_s))
     even = float(np.percentile(off_s, 100.0 * _STEADY)) < _EVEN * abs(gained_s)
     return ClockStep(gained_s, int(logs_ns[first])) if even else None
+
+
+def leaps(stamps_ns: Stamps, logs_ns: Stamps) -> list[tuple[int, ClockStep]]:
+    """Return where (index) and how a clock was set by whole seconds while its messages came evenly: UTC to GPS time, a leap second, an hour.
+
+    Where they do not come evenly they may be late from then on. The recording times tell how many seconds, and so exactly by how much.
+    """
+    if len(stamps_ns) < 2 * _FEWEST_BESIDE:
+        return []
+    ahead_ns, apart_ns = stamps_ns - logs_ns, np.diff(logs_ns)
+    by_ns, uneven_ns = np.diff(ahead_ns), np.abs(apart_ns - np.median(apart_ns))
+    found: list[tuple[int, ClockStep]] = []
+    for i in (np.flatnonzero((np.abs(by_ns) > 0.5 * NS_PER_S) & (2 * uneven_ns < np.abs(by_ns))) + 1).tolist():
+        before_ns, after_ns = ahead_ns[max(i - _BESIDE, found[-1][0] if found else 0) : i], ahead_ns[i : i + _BESIDE]
+        if min(len(before_ns), len(after_ns)) < _FEWEST_BESIDE:
+            continue
+        by_s = float(np.quantile(after_ns, _SOONER) - np.quantile(before_ns, _SOONER)) / NS_PER_S
+        whole_s = round(by_s)
+        here = abs(by_ns[i - 1] / NS_PER_S - whole_s) < LEAP_S
+        if whole_s and here and abs(by_s - whole_s) < _WHOLE_S:
+            found.append((i, ClockStep(float(whole_s), int(logs_ns[i]))))
+    return found
+
+
+def without_leaps(stamps_ns: Stamps, logs_ns: Stamps, latency_s: float, whose: str) -> tuple[Stamps, str]:
+    """Return stamps (N,) without the leaps of their clock, and a line that says so; empty where there is none.
+
+    Args:
+        latency_s: usual one of the IMU. The part of the stamps whose own is nearest to it is kept.
+    """
+    found = leaps(stamps_ns, logs_ns)
+    if not found:
+        return stamps_ns, ""
+    off_ns = np.zeros(len(stamps_ns), dtype=np.int64)
+    for i, at in found:
+        off_ns[i:] += duration_ns(at.by_s)
+    parts = np.split(np.arange(len(stamps_ns)), [i for i, _ in found])
+    apart_s = [abs(usual_latency_s(stamps_ns[part], logs_ns[part]) - latency_s) for part in parts]
+    off_ns -= off_ns[parts[int(np.argmin(apart_s))][0]]
+    what, wrong = " and ".join(at.what(whose) for _, at in found), int((off_ns != 0).sum())
+    said = f"{what}: {wrong} of its stamps are put right by that; the others are nearer to the IMU's"
+    return stamps_ns - off_ns, said
 
 
 def corrected_ns(stamp_ns: int, config: SensorConfig, elapsed_ns: int) -> int:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import compress
 from typing import Any, TypeVar
 
@@ -27,7 +27,15 @@ from graphloc.frontends._rejections import Rejection, rejected
 from graphloc.frontends._turns import SCATTERED, scattered
 from graphloc.frontends.decode import Decoded, ImuReading
 from graphloc.ledger import LedgerRow
-from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, ImuSeries, PoseFix
+from graphloc.measurements import (
+    BodyVelocity,
+    CompassHeading,
+    GnssPosition,
+    GnssVelocity,
+    ImuSeries,
+    Measurement,
+    PoseFix,
+)
 from graphloc.signals.frozen_imu import WHY, frozen_imu_warning, frozen_samples
 from graphloc.signals.imu_spikes import WHY as SPIKE
 from graphloc.signals.imu_spikes import spike_warning, spikes
@@ -95,6 +103,24 @@ class Readings:
             outcome=rejection.outcome,
             reason=rejection.reason,
         )
+
+
+def right_leaps(sensors: Sequence[Readings], warnings: list[str]) -> None:
+    """Put stamps right where a sensor's clock was set by whole seconds; not where the IMU's was, too: then they are one clock."""
+    imu = next((r for r in sensors if r.config.kind == "imu" and r.stamps_ns), None)
+    if imu is None or _clock.leaps(imu.stamps(), imu.logs()):
+        return
+    latency_s = _clock.usual_latency_s(imu.stamps(), _clock.steady_logs(imu.stamps(), imu.logs()))
+    for r in (r for r in sensors if r.stamps_ns and r is not imu):
+        logs_ns = _clock.steady_logs(r.stamps(), r.logs())
+        stamps_ns, said = _clock.without_leaps(r.stamps(), logs_ns, latency_s, r.sensor)
+        if said:
+            warnings.append(said)
+            r.stamps_ns[:] = stamps_ns.tolist()
+            r.values[:] = [
+                replace(v, stamp_ns=n) if isinstance(v, Measurement) else v
+                for v, n in zip(r.values, r.stamps_ns, strict=True)
+            ]
 
 
 def reject_jumps(sensors: Sequence[Readings], warnings: list[str]) -> list[LedgerRow]:

@@ -42,6 +42,7 @@ from graphloc.frontends._readings import (
     reject_scattered,
     reject_set_back,
     reject_stored,
+    right_leaps,
     thin,
 )
 from graphloc.frontends._references import Reference, check_speed, true_trajectory
@@ -105,6 +106,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
         scan_latencies = _scan_latencies(bag, config)
         warnings = list(bag.warnings)
 
+    right_leaps(sensors, warnings)
     rows += reject_jumps(sensors, warnings)
     rows += reject_far_poses(sensors, warnings)
     rows += reject_set_back(sensors, [b for b in (truth, check) if b], warnings)

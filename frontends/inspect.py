@@ -41,11 +41,13 @@ from graphloc.frontends._clock import (
     FEWEST_STAMPS,
     GAIN_LIMIT_S,
     ClockStep,
+    leaps,
     recorder_set,
     refuse_woven,
     steady_logs,
     step,
     usual_latency_s,
+    without_leaps,
 )
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
@@ -272,6 +274,8 @@ def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
     if recorder is not None:
         warnings += (recorder.said_of_recorder,)
         streams = [s.logged(steady_logs(s.stamps_ns, s.logs_ns)) for s in streams]
+    streams, said_of_leaps = _without_leaps(streams)
+    warnings += said_of_leaps
     streams = [evenly(s) if s.msgtype == IMU and len(s) else s for s in without_drift(streams)]
     for stream in streams:
         if stream.msgtype == IMU:
@@ -439,6 +443,24 @@ def _timed_velocity(report: VelocityReport, late: MotionOffset | None, together:
     return replace(report, late_s=fixes_late_s, late_with_fixes=True)
 
 
+def _without_leaps(streams: Sequence[TopicData]) -> tuple[list[TopicData], tuple[str, ...]]:
+    """Return the streams with stamps put right as they are when the bag is read (`without_leaps`), and a line for each such topic."""
+    imu = next((s for s in streams if s.msgtype == IMU and len(s)), None)
+    if imu is None or leaps(imu.stamps_ns, imu.logs_ns):
+        return list(streams), ()
+    latency_s = usual_latency_s(imu.stamps_ns, imu.logs_ns)
+    right, lines = [], dict[str, str]()
+    for stream in streams:
+        topic = stream.topic.partition(" ")[0]
+        if not stream.recorded:
+            stamps_ns, said = without_leaps(stream.stamps_ns, stream.logs_ns, latency_s, topic)
+            if said:
+                stream = stream.stamped(stamps_ns)
+                lines.setdefault(topic, said)
+        right.append(stream)
+    return right, tuple(lines.values())
+
+
 def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
     """Return which clocks were set during the run, by topic, unless all were alike: then they are one clock, and what it leaves is a gap."""
     stamped = [s for s in streams if len(s) >= FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED]
@@ -485,8 +507,10 @@ def _lacking(
     lines = []
     if not any(not imu.missing for imu in imus):
         lines.append("no whole IMU in it: smooth, replay and compare need one (sensor_msgs/Imu, 50 Hz or more)")
-    if not (gnss or bag.lidars or bag.cameras or any(report.role == "pose" or report.grid for report in odometry)):
-        lines.append("nothing in it tells the place: no GNSS fix that can be used, no pose")
+    if not (gnss or bag.cameras or any(report.role == "pose" or report.grid for report in odometry)):
+        around = " (scans are matched around a track, which they cannot begin)" if bag.lidars else ""
+        said = "nothing in it tells the place: no GNSS fix that can be used, no pose, no camera for tags"
+        lines.append(f"{said}; smooth, replay and compare need one: record it, too{around}")
     read = {name.partition(" ")[0] for name in bag.streams}  # of NMEA a stream is a sentence
     others = [
         t

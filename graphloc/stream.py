@@ -20,7 +20,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import VesselConfig, load_config
-from graphloc.errors import ConfigError
 from graphloc.estimate import Estimate, Event
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Array, Datum, heading_deg_from_yaw, rpy_from_rotation
@@ -247,12 +246,6 @@ def serve(
 
 def _refuse(config: VesselConfig, where: str) -> None:
     refuse_world_without_datum(config, where, SENSORS)
-    enabled = {name: sensor for name, sensor in config.sensors.items() if sensor.enabled}
-    for name, sensor in enabled.items():
-        if sensor.mount.tf_frame:
-            raise ConfigError(
-                f"{where}: sensors.{name}.mount.tf_frame: a stream has no /tf_static; give xyz_m and rpy_deg, or take the "
-                "vessel.effective.yaml that `graphloc smooth` writes beside its results: there mounts are in numbers"
-            )
-        if sensor.kind in ("aerial", "apriltag"):
+    for name, sensor in config.sensors.items():
+        if sensor.enabled and sensor.kind in ("aerial", "apriltag"):
             log.warning("%s: sensors.%s: a stream has no line for kind %s; it stays silent", where, name, sensor.kind)

@@ -769,15 +769,23 @@ def test_a_receiver_that_claims_more_accuracy_is_taken_before_one_that_says_more
     assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == [used]
 
 
-def test_what_no_run_can_do_without_is_reported(tmp_path: Path) -> None:
-    """A draft of an IMU alone was all that came of a bag whose places are in messages of another kind."""
+@pytest.mark.parametrize("scanned", [False, True])
+def test_what_no_run_can_do_without_is_reported(scanned: bool, tmp_path: Path) -> None:
+    """A draft of an IMU alone was all that came of a bag whose places are in messages of another kind; of scans beside it nothing was said."""
     make = Messages(2)
     make.register("float64 latitude\nfloat64 longitude", "foxglove_msgs/msg/LocationFix")
     items = [item for item in drive(make, seconds=10) if item[0] == "/imu"]
     place = make.t["foxglove_msgs/msg/LocationFix"](latitude=57.7, longitude=11.9)
-    found, _, _ = look(tmp_path, [*items, ("/location", items[-1][1], place)], make)
+    cloud = make.t["sensor_msgs/msg/PointCloud2"](
+        header=make.header(START_NS, "lidar"), height=1, width=0, fields=[], is_bigendian=False, point_step=12, row_step=0,
+        data=np.zeros(0, np.uint8), is_dense=True,
+    )  # fmt: skip
+    scans = [("/scans", items[-1][1], cloud)] if scanned else []
+    found = inspect_bag(write_bag(tmp_path / "run", make, [*items, *scans, ("/location", items[-1][1], place)]))
     said = " | ".join(found.warnings)
     assert "nothing in it tells the place" in said
+    assert "smooth, replay and compare need one: record it, too" in said
+    assert ("scans are matched around a track" in said) is scanned
     assert "/location (foxglove_msgs/LocationFix)" in said
     assert "IMU" not in said
 

@@ -10,7 +10,7 @@ import pytest
 
 from graphloc.app import configured
 from graphloc.config import ImuConfig, VesselConfig
-from graphloc.frontends._clock import ClockStep, gain
+from graphloc.frontends._clock import ClockStep, gain, leaps
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import Outcome
@@ -184,19 +184,48 @@ def test_a_clock_that_is_set_during_the_run_does_not_drift(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("topic", "by_s", "way"), [("/fix", 3, "forward"), ("/fix", -3, "back"), ("/imu", 3, "forward")]
+    ("topic", "by_s", "way"), [("/fix", 3.3, "forward"), ("/fix", -3.3, "back"), ("/imu", 3, "forward")]
 )
-def test_a_clock_that_was_set_is_named_with_the_time(topic: str, by_s: int, way: str, tmp_path: Path) -> None:
+def test_a_clock_that_was_set_is_named_with_the_time(topic: str, by_s: float, way: str, tmp_path: Path) -> None:
     """By inspect, which drafted an offset as if it held throughout, and when the bag is read."""
-    change = {topic: lambda ns: ns + by_s * S * (ns > START_NS + 25 * S)}
+    change = {topic: lambda ns: ns + round(by_s * S) * (ns > START_NS + 25 * S)}
     seen, config, _ = look(tmp_path, restamped(change), MAKE)
     (said,) = [w for w in seen.warnings if "was set" in w]
-    assert said.startswith(f"the clock of {topic} was set {way} by 3.0")
+    assert said.startswith(f"the clock of {topic} was set {way} by {abs(by_s):.2f} s")
     assert utc_text(START_NS + 25 * S)[:18] in said  # to the second
     lines = [w for w in read(tmp_path, config).warnings if "the clock of" in w or "its clock is" in w]
     (line,) = lines  # nor an offset beside it, which holds on one side only
     whose, others = ("gnss", "gnss") if topic == "/fix" else ("imu", "gnss, compass")
-    assert line.startswith(f"{others}: the clock of {whose} was set {way} by 3.0")
+    assert line.startswith(f"{others}: the clock of {whose} was set {way} by {abs(by_s):.2f} s")
+
+
+@pytest.mark.parametrize(("by_s", "set_s"), [(18, 5), (-18, 25), (1, 50), (-3600, 25)])
+def test_a_clock_that_is_set_by_whole_seconds_is_put_right(by_s: int, set_s: int, tmp_path: Path) -> None:
+    """UTC and GPS time, a leap second, a time zone. It was told, and the vessel put where it was 18 s before; after an hour, all was lost."""
+    wrong = lambda ns: ns + by_s * S * (ns >= START_NS + set_s * S)
+    read_as = {}
+    for name, change in (("set", {"/fix": wrong}), ("right", {})):
+        (tmp_path / name).mkdir()
+        found, config, _ = look(tmp_path / name, restamped(change), MAKE)
+        recording = read(tmp_path / name, config)
+        read_as[name] = config, [(m.stamp_ns, m.seq) for m in recording.measurements]
+        for said in (w for w in (*found.warnings, *recording.warnings) if "the clock of" in w):
+            assert f"by {abs(by_s)}.00 s at {utc_text(START_NS + set_s * S + WAY_NS['/fix'])}" in said
+            assert f": {300 - 5 * set_s} of its stamps are put right" in said
+        assert sum("put right" in w for w in found.warnings) == (name == "set")
+        assert sum("put right" in w for w in recording.warnings) == (name == "set")
+        assert not recording.clock_doubts
+    assert read_as["set"] == read_as["right"]
+
+
+def test_messages_that_are_late_by_a_whole_second_are_of_no_clock_that_was_set() -> None:
+    """Nor are those of a recorder that was set, nor is one wrong stamp."""
+    stamps_ns = START_NS + np.arange(0, 60 * S, S // 5)
+    later_ns = S * (np.arange(300) >= 100)
+    assert [at.by_s for _, at in leaps(stamps_ns + later_ns, stamps_ns)] == [1.0]
+    for by_s in (1, 18, -18):
+        assert leaps(stamps_ns, stamps_ns + by_s * later_ns) == []
+    assert leaps(stamps_ns + 18 * S * (np.arange(300) == 100), stamps_ns) == []
 
 
 def test_clocks_that_are_set_together_are_one(tmp_path: Path) -> None:

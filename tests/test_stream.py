@@ -553,7 +553,10 @@ def test_a_reader_that_goes_away_ends_it_quietly(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"sensors": {"imu": {"mount": {"tf_frame": "imu_link"}}}}, "no /tf_static"),
+        (
+            {"sensors": {"imu": {"mount": {"tf_frame": "imu_link"}}}},
+            r"sensors\.imu\.mount\.tf_frame: no /tf_static .*vessel\.effective\.yaml",
+        ),
         ({"sensors": {"match": {"kind": "pose"}}}, "set datum:"),
     ],
 )

@@ -109,6 +109,33 @@ def test_a_drift_does_not_turn_the_heading_against_the_compass(monkeypatch: pyte
     assert np.abs(antenna[0] - antenna[1]).max() < 1e-6
 
 
+def test_in_an_outage_at_the_end_the_antenna_moves_as_with_the_drift_as_a_state(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And before the first fix. It went on with a velocity that followed the drift, which was in no bound."""
+    run, recording, config = drifting(1, 2.0, compass_hz=5.0)
+    begin_ns, end_ns = (int(run.truth.stamps_ns[0]) + round(s * NS_PER_S) for s in (20.0, 40.0))
+    kept = [m for m in recording.measurements if not isinstance(m, GnssPosition) or begin_ns <= m.stamp_ns <= end_ns]
+    recording = replace(recording, measurements=tuple(kept))
+    config = with_few_states(config, 2.0)
+    gnss = config.sensors["gnss"]
+    slow_error = gnss.slow_error.model_copy(update={"enabled": True, "jumps": False})
+    full = config.with_sensors({"gnss": gnss.model_copy(update={"slow_error": slow_error})})
+    lever_m = gnss.mount.t_body_sensor_m
+
+    def moved_m(config: VesselConfig) -> Array:
+        """How far the antenna is from where the fixes begin, and end, before and after."""
+        track = app.smooth_recording(recording, config).solution.trajectory
+        antenna = track.p_world_m + track.R_world_body @ lever_m
+        first, last = np.flatnonzero((track.stamps_ns >= begin_ns) & (track.stamps_ns <= end_ns))[[0, -1]]
+        return np.concatenate([antenna[: first + 1] - antenna[first], antenna[last:] - antenna[last]])[:, :2]
+
+    taken_back, as_state = moved_m(config), moved_m(full)
+    monkeypatch.setattr(_solution, "with_drift_taken_back", lambda result: result)
+    followed = moved_m(config)
+    assert rms(followed - as_state) > 4.0 * rms(taken_back - as_state)
+
+
 def test_an_antenna_of_unknown_place_stays_where_it_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """It was held where it is configured, so the one found moved as the heading was turned back."""
     _, recording, config = drifting(1, 2.0, compass_hz=5.0)

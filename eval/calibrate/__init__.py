@@ -114,10 +114,13 @@ def _of_one_clock(sensor: str, config: VesselConfig) -> list[str]:
 
 
 def _imu_at_origin(recording: Recording, config: VesselConfig) -> str:
-    """Return the IMU whose place in the body is not set; empty where it is. Fixes and an IMU tell how far apart they are, and no more."""
+    """Return the IMU whose place in the body is 0; empty where it is not. Fixes and an IMU tell how far apart they are, and no more.
+
+    That 0 may be a guess of `inspect`, and in a vessel.effective.yaml it may be what /tf_static says.
+    """
     imu = "" if recording.imu is None else recording.imu.sensor
-    unset = imu in config.sensors and imu not in recording.mounts and not any(config.sensors[imu].mount.xyz_m)
-    return imu if unset else ""
+    zero = imu in config.sensors and imu not in recording.mounts and not any(config.sensors[imu].mount.xyz_m)
+    return imu if zero else ""
 
 
 def _suggestion(
@@ -176,9 +179,7 @@ def _action(
         # Where fixes and the IMU's accelerations say the heading, the IMU's own yaw in the craft is in it, which is no state.
         action += f"; or sensors.{recording.imu.sensor}.mount.rpy_deg[2] is off, the other way"
     if name[1] in _AXIS and (imu := _imu_at_origin(recording, config)):
-        action += (
-            f"; or it is the IMU that sits elsewhere, the other way: measure sensors.{imu}.mount.xyz_m, too, which is 0"
-        )
+        action += f"; or it is the IMU that sits elsewhere, the other way: measure sensors.{imu}.mount.xyz_m, too, unless the 0 there is measured"
     return action
 
 

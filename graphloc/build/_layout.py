@@ -37,8 +37,8 @@ def mount_of(name: str, config: SensorConfig, mounts: Mounts) -> tuple[Array, Ar
     """
     if config.mount.tf_frame and name not in mounts:
         raise InputError(
-            f"sensors.{name}.mount.tf_frame: no /tf_static is read here, and no mount of {name} is given (`mounts`); give xyz_m and "
-            "rpy_deg instead, as in the vessel.effective.yaml of a run of the bag"
+            f"sensors.{name}.mount.tf_frame: no /tf_static is read here: give xyz_m and rpy_deg, or take the vessel.effective.yaml that "
+            "`graphloc smooth` writes beside its results, where mounts are in numbers; a program may give them in `mounts`"
         )
     return mounts.get(name) or (config.mount.t_body_sensor_m, config.mount.R_body_sensor)
 

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the drift of the only position sensor did to heading and velocity, taken back.
+"""What the drift of the only position sensor did to heading and velocity, and to the place where no fixes come, taken back.
 
 Its slow error is left out of the graph (`Stream.left_out`), so fixes count as if their errors were white: hundreds of them a minute
 overrule a compass by six of its sigmas, where the drift that bends their track is the likelier reason. With the error as states
 the linearised run weighs them as configured. Its heading, velocity and slow states of the other sensors are taken over. The antenna stays
-where the fixes have it, as nothing tells which part of their error is which.
+where the fixes have it, as nothing tells which part of their error is which; before the first and after the last of them it moves from
+there as in that run.
 """
 
 from __future__ import annotations
@@ -26,9 +27,10 @@ _LINEAR_RAD = np.radians(15.0)  # a turn up to which the linearised run holds
 
 
 def with_drift_taken_back(result: BatchResult) -> BatchResult:
-    """Return the result with heading, velocity and slow states as they are where the left-out slow error is a state; covariances as they are.
+    """Return the result with heading, velocity, slow states and, where no fixes come, place as they are where the left-out error is a state.
 
-    Nothing changes where no error is left out, or where the heading would turn by more than the linearised run can tell.
+    Covariances stay as they are. Nothing changes where no error is left out, or where the heading would turn by more than the linearised
+    run can tell.
 
     Raises:
         RuntimeError: a state is not determined.
@@ -43,18 +45,27 @@ def with_drift_taken_back(result: BatchResult) -> BatchResult:
     dx = normal_solver(J)(J.T @ b)
     if not np.isfinite(dx).all():
         raise RuntimeError("not finite")
-    turned = dx[rows.first_pose :].reshape(-1, 6)[:, :3]
-    if np.linalg.norm(turned, axis=1).max() > _LINEAR_RAD:
+    fixed = [k for s in problem.streams if s.left_out is not None for k in s.state[rows.used(s)].tolist()]
+    turned, shifted = np.split(dx[rows.first_pose :].reshape(-1, 6), 2, axis=1)
+    if not fixed or np.linalg.norm(turned, axis=1).max() > _LINEAR_RAD:
         return result
     faster = dx[rows.first_velocity : rows.first_pose].reshape(-1, 3)
     moved, antenna = gtsam.Values(values), np.asarray(followed.mount.translation())
-    if (off_m := antenna_off_m(corrections(solved_constants(followed, values), followed.mount))) is not None:
-        antenna = antenna + off_m
-    for k, (turn, dv) in enumerate(zip(turned, faster, strict=True)):
-        pose = values.atPose3(keys.pose(k))
-        R = pose.rotation().compose(gtsam.Rot3.Expmap(turn))
-        moved.update(keys.pose(k), gtsam.Pose3(R, pose.transformFrom(antenna) - R.rotate(antenna)))
-        moved.update(keys.velocity(k), values.atVector(keys.velocity(k)) + dv)
+    if (elsewhere_m := antenna_off_m(corrections(solved_constants(followed, values), followed.mount))) is not None:
+        antenna = antenna + elsewhere_m
+    poses = [values.atPose3(keys.pose(k)) for k in range(rows.states)]
+    free = [
+        gtsam.Pose3(pose.rotation().compose(gtsam.Rot3.Expmap(turn)), pose.transformFrom(shift))
+        for pose, turn, shift in zip(poses, turned, shifted, strict=True)
+    ]
+    off_m = np.array(
+        [new.transformFrom(antenna) - old.transformFrom(antenna) for new, old in zip(free, poses, strict=True)]
+    )
+    off_m -= off_m[np.clip(np.arange(rows.states), min(fixed), max(fixed))]
+    for k, (old, new) in enumerate(zip(poses, free, strict=True)):
+        place_m = old.transformFrom(antenna) + off_m[k] - new.rotation().rotate(antenna)
+        moved.update(keys.pose(k), gtsam.Pose3(new.rotation(), place_m))
+        moved.update(keys.velocity(k), values.atVector(keys.velocity(k)) + faster[k])
     for key, change in _slow_states(full, dx[: rows.first_velocity]):
         if values.exists(key):
             moved.update(key, values.atVector(key) + change)
