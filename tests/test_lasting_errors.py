@@ -105,11 +105,11 @@ def test_it_goes_on_after_a_restart_but_not_on_other_axes(tmp_path: Path) -> Non
     feed(smoother(run, snapshot=path), run, came)
     (name,) = run.config.of_kind("pose")
     snapshot = Snapshot.read(path, "imu")
-    assert np.abs(snapshot.anchor_for(setup_of(run.config).settings).slow[name].value).max() > 0.1
+    assert np.abs(snapshot.for_settings(setup_of(run.config).settings).anchor.slow[name].value).max() > 0.1
     resumed = feed(smoother(run, snapshot=path), run, rest)
     assert any(e.startswith("resumed from a snapshot") for e in resumed.events)
     other = run.config.sensors[name].model_copy(update={"axes": ("x", "z")})
-    assert name not in snapshot.anchor_for(setup_of(run.config.with_sensors({name: other})).settings).slow
+    assert name not in snapshot.for_settings(setup_of(run.config.with_sensors({name: other})).settings).anchor.slow
 
 
 @pytest.mark.parametrize(

@@ -223,7 +223,7 @@ def test_a_delay_that_was_found_goes_on_after_a_restart(tmp_path: Path) -> None:
         online = smoother(other, snapshot=copy)
         fed = feed(online, other, came[3 * len(came) // 4 :][: len(came) // 40])
         said = [e for e in fed.events if "snapshot" in e]
-        found[key] = said[0], name in snapshot.anchor_for(setup_of(other.config).settings).slow
+        found[key] = said[0], name in snapshot.for_settings(setup_of(other.config).settings).anchor.slow
     assert found["on"][0].startswith("resumed from a snapshot")
     assert found["on"][1]
     assert found["set"][0].startswith("resumed from a snapshot")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +17,7 @@ from graphloc.online._heading_check import HeadingCheck
 from graphloc.online._live import ReceiverDetectors
 from graphloc.online._noise import ImuNoise
 from graphloc.online._odometry import Odometry
+from graphloc.online._sensor_clock import SensorClock
 from graphloc.online._sensor_noise import SensorNoise
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
@@ -36,6 +38,7 @@ class PersistentState:
         odometry: the `odom` frame; None before the first start.
         motion_model: motion model. heading_check: whether the heading fits the motion.
         receivers: detectors of what a receiver repeats, and of its position jumps, by sensor.
+        clocks: of the sensors, by name, put right where they are set.
         frozen: receivers that were last reported as frozen.
         unmodelled: what slow errors that are left out, and the IMU's mount, do to the newest state; None where there is nothing of that.
     """
@@ -50,6 +53,7 @@ class PersistentState:
     motion_model: MotionModel = field(default_factory=MotionModel)
     heading_check: HeadingCheck = field(default_factory=HeadingCheck)
     receivers: dict[str, ReceiverDetectors] = field(default_factory=dict)
+    clocks: dict[str, SensorClock] = field(default_factory=lambda: defaultdict(SensorClock))
     frozen: set[str] = field(default_factory=set)
     unmodelled: UnmodelledError | None = None
 
@@ -61,7 +65,7 @@ class PersistentState:
             noise: raised as the snapshot's is. sensors: the enabled ones, by name: their configuration.
         """
         noise.at_least(*found.noise)
-        return cls(
+        persistent = cls(
             datum=found.datum,
             noise=noise,
             sensor_noise=SensorNoise(
@@ -80,6 +84,9 @@ class PersistentState:
             agreed_ns=dict(found.agreed_ns),
             odometry=Odometry(found.anchor.stamp_ns, found.p_odom_m, found.R_odom_body),
         )
+        for name, set_ns in found.clocks_set_ns.items():
+            persistent.clocks[name].set_ns = set_ns
+        return persistent
 
     def snapshot(self, setup: Setup, anchor: Anchor, imu: ImuSample, agreed_ns: Mapping[str, int]) -> Snapshot:
         """Return what a run can resume from after its process was killed.
@@ -92,6 +99,7 @@ class PersistentState:
         return Snapshot(
             vessel=setup.config.vessel,
             settings=setup.settings,
+            clocks_set_ns={name: clock.set_ns for name, clock in self.clocks.items() if clock.set_ns},
             anchor=anchor,
             imu=imu,
             datum=self.datum,

@@ -182,9 +182,19 @@ class OnlineSmoother:
         if m.sensor not in self._setup.measuring:
             self._ignore(m, _NOT_ASKED)
             return None
+        newest, found = self._intake.newest, [m]
+        if newest is not None:
+            found, said = self._persistent.clocks[m.sensor].take(m, newest.stamp_ns)
+            self._say(said)
+        for right in found:
+            self._take(right)
+        return None
+
+    def _take(self, m: Measurement) -> None:
+        """Keep a measurement, its stamp put right, until the states reach it."""
         if self._thinnings[m.sensor].drops(m.stamp_ns):
             self._ledger.drop(m, Outcome.REJECTED, THINNED)
-            return None
+            return
         newest, tracking = self._intake.newest, self._tracking
         if newest is not None and m.stamp_ns - newest.stamp_ns > _AHEAD_S * 1e9:
             ahead_s = (m.stamp_ns - newest.stamp_ns) * 1e-9
@@ -199,7 +209,6 @@ class OnlineSmoother:
             )
         else:
             tracking.keep(m)
-        return None
 
     def _ignore(self, m: Measurement, why: str) -> None:
         self._ledger.drop(m, Outcome.IGNORED, why)
@@ -460,25 +469,30 @@ class OnlineSmoother:
             self._say(f"the snapshot is {age_s:.1f} s old, more than the {bridge_s:g} s (max_bridge_s) that "
                       "can be bridged: starts without it")  # fmt: skip
             return
+        found = found.for_settings(setup.settings)
         persistent = PersistentState.resumed(
             found, self._configured_noise(), {n: setup.config.sensors[n] for n in setup.measuring}
         )
         try:
-            anchor = found.anchor_for(setup.settings)
-            tracking = Tracking(self._setup, persistent, self._ledger, anchor, [found.imu, newest])
+            tracking = Tracking(self._setup, persistent, self._ledger, found.anchor, [found.imu, newest])
             persistent.unmodelled = tracking.lag.unmodelled(last=found.unmodelled)
         except Exception as error:  # noqa: BLE001 - as in `_advance`
             self._say(f"the snapshot cannot be used ({in_one_line(error)}): starts without it")
             return
         self._tracking, self._persistent = tracking, persistent
         waiting = [m for m in self._waiting.taken() if m is not newest]
-        tracking.resume(anchor, found.imu, newest)
+        tracking.resume(found.anchor, found.imu, newest)
         self._say(f"resumed from a snapshot {age_s:.1f} s old", warns=False)
         for m in waiting:
-            self.feed(m)
+            if isinstance(m, ImuSample):
+                self._feed_imu(m)
+            else:
+                self._take(persistent.clocks[m.sensor].right(m))
 
     def finish(self) -> list[LedgerRow]:
         """End: return the rows of all that is left."""
+        for m in [m for clock in self._persistent.clocks.values() for m in clock.left()]:
+            self._take(m)
         why = f"never started: waiting for {self._waiting.why}"
         if self._tracking is not None:
             why = "the run ended before there was a state at its stamp"

@@ -19,7 +19,7 @@ from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import ErrorSizes
 from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE
 
-_VERSION = 9
+_VERSION = 10
 _EVERY_S = 2.0
 _MOST_TIMES = 1e4  # of a data sheet's noise, that an IMU on any engine has
 
@@ -35,6 +35,7 @@ class Snapshot:
             and on that of the accelerometer. sensor_noise: those of other sensors' sigmas (`SensorNoise.times`).
         heading: where no sensor measures it, how far it may be off.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
+        clocks_set_ns: by how much the clocks of sensors have been set (`SensorClock`), by sensor.
         settings: by sensor, what slow states and constants in the anchor are, and what they are added to (`Setup.settings`).
         unmodelled: sizes of `UnmodelledError`; None where no slow error is left out, and the IMU's mount is right.
     """
@@ -50,20 +51,24 @@ class Snapshot:
     heading: UnmeasuredHeading | None
     p_odom_m: Array
     R_odom_body: Array
+    clocks_set_ns: Mapping[str, int]
     settings: Mapping[str, Any]
     unmodelled: ErrorSizes | None
 
-    def anchor_for(self, now: Mapping[str, Any]) -> Anchor:
-        """Return the anchor without what is known of sensors that are set otherwise now: corrected as told, they would be corrected twice.
+    def for_settings(self, now: Mapping[str, Any]) -> Snapshot:
+        """Return it without what is known of sensors that are set otherwise now: corrected as told, they would be corrected twice.
 
         Args:
             now: `Setup.settings`.
         """
         same = {name for name, were in self.settings.items() if were == now.get(name)}
-        return replace(
+        anchor = replace(
             self.anchor,
             slow={name: known for name, known in self.anchor.slow.items() if name in same},
             constants={of: known for of, known in self.anchor.constants.items() if of[0] in same},
+        )
+        return replace(
+            self, anchor=anchor, clocks_set_ns={name: ns for name, ns in self.clocks_set_ns.items() if name in same}
         )
 
     def write(self, path: Path) -> None:
@@ -83,6 +88,7 @@ class Snapshot:
             "sensor_noise": {name: dict(times) for name, times in self.sensor_noise.items()},
             "heading": None if self.heading is None else asdict(self.heading),
             "agreed_ns": dict(self.agreed_ns),
+            "clocks_set_ns": dict(self.clocks_set_ns),
             "settings": dict(self.settings),
             "odom": [self.p_odom_m.tolist(), self.R_odom_body.tolist()],
             "unmodelled": None if self.unmodelled is None else [of.tolist() for of in self.unmodelled],
@@ -122,6 +128,7 @@ class Snapshot:
             heading=None if raw["heading"] is None else UnmeasuredHeading(**raw["heading"]),
             p_odom_m=p,
             R_odom_body=R,
+            clocks_set_ns={str(n): int(ns) for n, ns in raw["clocks_set_ns"].items()},
             settings=dict(raw["settings"]),
             unmodelled=ErrorSizes(*sizes) if sizes else None,
         )

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sensor's clock that is set by whole seconds in mid-run: a receiver learns of leap seconds, or goes from UTC to GPS time.
+
+Its next fixes seem to come from the future, or long after; used at their stamps they are seconds of motion off.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+from statistics import median
+
+from graphloc.measurements import Measurement
+from graphloc.time import NS_PER_S, utc_text
+
+_REMEMBERED, _FEWEST = 20, 10  # measurements that tell how their stamps and arrival usually are
+_IN_A_ROW = 5  # measurements after a leap that tell it: an outlying stamp is one
+_SEEMS_S, _WHOLE_S = 0.5, 0.1  # by which it seems to be one, and may be off whole seconds, as some messages take longer
+_SLOWEST_S = 1.2  # between arrivals: of slower sensors the first ones held back would leave the window meanwhile
+_UNEVEN = 0.5  # of the usual time between arrivals: a message that waited, or an IMU that stalled, is no leap
+_GPS_AHEAD_S = 18  # of UTC, since 2017
+_FUTURE_S = 3.0  # ahead of the IMU, all the time: no message is that much faster
+
+
+class SensorClock:
+    """Puts right the stamps of one sensor as they arrive, by those of the IMU.
+
+    A leap is one that comes while both arrive as evenly as before, and that is the same for some measurements in a row, which are held
+    back so long. An IMU whose clock is set does not go on evenly. (Offline the times of recording tell it: `frontends/_clock.py`.)
+
+    Attributes:
+        set_ns: by how much the clock has been set so far; it is taken off each stamp.
+    """
+
+    def __init__(self) -> None:
+        self.set_ns = 0
+        self._ahead_ns: deque[int] = deque(maxlen=_REMEMBERED)  # of the IMU's newest sample, when they came
+        self._apart_ns: deque[int] = deque(maxlen=_REMEMBERED)  # time of the IMU between arrivals
+        self._imu_ns = 0  # newest sample at the last arrival
+        self._held: list[tuple[Measurement, int]] = []  # each with its leap, ns
+        self._said = False
+
+    def right(self, m: Measurement) -> Measurement:
+        """Return a measurement with its stamp put right by what is known so far."""
+        return replace(m, stamp_ns=m.stamp_ns - self.set_ns) if self.set_ns else m
+
+    def take(self, m: Measurement, imu_ns: int) -> tuple[list[Measurement], str]:
+        """Take in a measurement that has arrived.
+
+        Args:
+            imu_ns: stamp of the newest IMU sample by then.
+
+        Returns:
+            Those that can be used now, put right; and what is to be said.
+        """
+        m = self.right(m)
+        ahead_ns, apart_ns, self._imu_ns = m.stamp_ns - imu_ns, imu_ns - self._imu_ns, imu_ns
+        if len(self._ahead_ns) < _FEWEST:
+            return self._learn(m, ahead_ns, apart_ns), self._from_the_future(m.sensor)
+        usual_ns = median(self._apart_ns)
+        even = 0 < usual_ns <= _SLOWEST_S * NS_PER_S and abs(apart_ns - usual_ns) <= _UNEVEN * usual_ns
+        by_ns = ahead_ns - round(median(self._ahead_ns))
+        if abs(by_ns) < _SEEMS_S * NS_PER_S and not self._held:
+            return self._learn(m, ahead_ns, apart_ns), ""
+        if not even or (self._held and abs(by_ns - self._held[0][1]) > _SEEMS_S * NS_PER_S):
+            return [*self._begin_anew(), m], ""
+        self._held.append((m, by_ns))
+        return self._decide() if len(self._held) == _IN_A_ROW else ([], "")
+
+    def left(self) -> list[Measurement]:
+        """Return what is held back, as it came."""
+        held, self._held = self._held, []
+        return [m for m, _ in held]
+
+    def _learn(self, m: Measurement, ahead_ns: int, apart_ns: int) -> list[Measurement]:
+        self._ahead_ns.append(ahead_ns)
+        self._apart_ns.append(apart_ns)
+        return [m]
+
+    def _from_the_future(self, sensor: str) -> str:
+        """Return what is to be said, once, where all stamps are ahead of the IMU's while it goes on."""
+        least_s, goes_on = min(self._ahead_ns) / NS_PER_S, median(self._apart_ns) > 0
+        if self._said or len(self._ahead_ns) < _FEWEST or least_s < _FUTURE_S or not goes_on:
+            return ""
+        self._said = True
+        return f"{sensor}: its stamps are {least_s:.1f} s ahead of the IMU's: of another clock? (time_offset_s)"
+
+    def _begin_anew(self) -> list[Measurement]:
+        self._ahead_ns.clear()
+        self._apart_ns.clear()
+        return self.left()
+
+    def _decide(self) -> tuple[list[Measurement], str]:
+        """Return what is held back, put right where it is by whole seconds, and what is to be said."""
+        by_s = median(by_ns for _, by_ns in self._held) / NS_PER_S
+        whole_s = round(by_s)
+        if not whole_s or abs(by_s - whole_s) > _WHOLE_S:
+            return self._begin_anew(), ""
+        self.set_ns += whole_s * NS_PER_S
+        found = [replace(m, stamp_ns=m.stamp_ns - whole_s * NS_PER_S) for m in self.left()]
+        said = f"{found[0].sensor}: its clock was set {'forward' if whole_s > 0 else 'back'} by {abs(whole_s)} s at {utc_text(found[0].stamp_ns)}"
+        if abs(whole_s) == _GPS_AHEAD_S:
+            said += f", as from {'UTC to GPS time' if whole_s > 0 else 'GPS time to UTC'}"
+        return found, f"{said}: its stamps are put right by that from there on"

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Online, a sensor's clock that is set by whole seconds in mid-run, and what only looks like it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors import INERTIAL, SENSORS
+from graphloc.frames import Array
+from graphloc.measurements import GnssPosition, Measurement
+from graphloc.online import OnlineSmoother
+from graphloc.online._sensor_clock import SensorClock
+from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish
+from tests.slowly import slowly
+
+SET_S, ENDS_S = 12.0, 24.0
+HZ = 4.0
+
+
+@cache
+def run_of() -> SimulatedRun:
+    scenario = Scenario(path="loops", duration_s=ENDS_S, noise="drift", pose_hz=0.0, imu_hz=50.0, gnss_hz=HZ, compass_hz=2.0)  # fmt: skip
+    return slowly(simulate(scenario, 5), 2.5)
+
+
+def with_clock_set(arrivals: Arrivals, by_s: float, from_s: float = SET_S) -> Arrivals:
+    """The fixes, from a time on, with stamps of a clock that was set."""
+    since_ns = arrivals[0].true_ns + from_s * 1e9
+    return [
+        replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns + round(by_s * 1e9)))
+        if isinstance(a.m, GnssPosition) and a.true_ns >= since_ns
+        else a
+        for a in arrivals
+    ]
+
+
+def whole(arrivals: Arrivals, online: OnlineSmoother | None = None) -> Fed:
+    online = online or OnlineSmoother(run_of().config, rows=SENSORS, inertial=INERTIAL)
+    return finish(online, feed(online, run_of(), arrivals))
+
+
+@pytest.mark.parametrize(
+    ("by_s", "what"), [(18.0, "forward by 18 s"), (-18.0, "back by 18 s"), (-1.0, "back by 1 s"), (3600.0, "forward by 3600 s")]
+)  # fmt: skip
+def test_fixes_whose_clock_is_set_are_used_at_their_own_time(by_s: float, what: str) -> None:
+    plain, arrivals = whole(arrivals_of(run_of())), with_clock_set(arrivals_of(run_of()), by_s)
+    fed = whole(arrivals)
+    assert complaints(arrivals, fed) == []
+    assert [what in e and "GPS time" in e for e in fed.events if e.startswith("gnss: its clock")] == [abs(by_s) == 18.0]
+    stamps, rows = ({row.seq: row for row in f.rows if row.sensor == "gnss"} for f in (plain, fed))
+    assert {n: row.outcome for n, row in rows.items()} == {n: row.outcome for n, row in stamps.items()}
+    assert {n: row.stamp_ns for n, row in rows.items()} == {n: row.stamp_ns for n, row in stamps.items()}
+    off_m = [np.linalg.norm(a.p_world_m - b.p_world_m) for a, b in zip(fed.estimates, plain.estimates, strict=True)]
+    assert max(off_m) < 0.5  # a second without fixes
+    assert off_m[-1] < 0.01
+
+
+def test_a_clock_that_was_set_is_known_after_a_kill(tmp_path: Path) -> None:
+    arrivals = with_clock_set(arrivals_of(run_of()), 18.0)
+    config, path = run_of().config, tmp_path / "snapshot.json"
+    online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL, snapshot=path)
+    since_ns = arrivals[0].true_ns + 19e9  # a fix comes first, and waits for the IMU
+    cut = next(n for n, a in enumerate(arrivals) if a.true_ns >= since_ns and isinstance(a.m, GnssPosition))
+    feed(online, run_of(), arrivals[:cut])
+    fed = whole(arrivals[cut:], OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL, snapshot=path))
+    assert any(e.startswith("resumed from a snapshot") for e in fed.events)
+    used = [row for row in fed.rows if row.sensor == "gnss"]
+    assert max(row.stamp_ns for row in used) <= arrivals[-1].true_ns
+    assert max(fed.errors_m[-5:]) < 3.0
+
+
+def test_stamps_that_are_ahead_from_the_start_are_told() -> None:
+    fed = whole(with_clock_set(arrivals_of(run_of()), 18.0, from_s=0.0))
+    assert sum("gnss: its stamps are 18.0 s ahead of the IMU's" in e for e in fed.events) == 1
+
+
+# What is none
+
+
+def stalled_imu(t_s: float) -> float:
+    """The IMU sends nothing for 5 s, and then what it has kept."""
+    return 10.0 if 10.0 <= t_s < 15.0 else t_s
+
+
+def steady_imu(t_s: float) -> float:
+    return t_s
+
+
+def on_time(t_s: float) -> float:
+    return t_s
+
+
+def delayed(t_s: float) -> float:
+    """From 10 s on each message takes 1 s longer."""
+    return t_s + 1.0 if t_s >= 10.0 else t_s
+
+
+def drifting(t_s: float) -> float:
+    """A clock that gains 1 s in 10 s."""
+    return t_s - 0.1 * max(t_s - 10.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("imu", "arrives", "stamp"),
+    [
+        (stalled_imu, on_time, on_time),
+        (steady_imu, delayed, on_time),
+        (steady_imu, on_time, lambda t_s: t_s + (2.0 if t_s == 12.0 else 0.0)),
+        (steady_imu, on_time, lambda t_s: t_s + (1.5 if t_s >= 12.0 else 0.0)),
+        (steady_imu, on_time, drifting),
+    ],
+    ids=["imu-stalls", "slower-link", "one-outlier", "no-whole-seconds", "drifts"],
+)
+def test_what_only_looks_like_a_leap_passes_as_it_comes(
+    imu: Callable[[float], float], arrives: Callable[[float], float], stamp: Callable[[float], float]
+) -> None:
+    clock, taken, sent = SensorClock(), list[Measurement](), list[Measurement]()
+    fix = next(a.m for a in arrivals_of(run_of()) if isinstance(a.m, GnssPosition))
+    for n in range(100):
+        t_s = n / HZ
+        m = replace(fix, stamp_ns=round(stamp(t_s) * 1e9), seq=n)
+        newest_ns = round(50.0 * imu(arrives(t_s))) * 20_000_000
+        found, said = clock.take(m, newest_ns)
+        sent.append(m)
+        taken += found
+        assert not said
+    assert [m.seq for m in (*taken, *clock.left())] == list(range(100))
+    assert all(a.stamp_ns == b.stamp_ns for a, b in zip(taken, sent, strict=False))
+
+
+def _random(t_s: Array, rng: np.random.Generator) -> Array:
+    return rng.uniform(0.0, 2.0, len(t_s))
+
+
+def _in_bursts(t_s: Array, rng: np.random.Generator) -> Array:
+    period_s = rng.uniform(0.5, 3.0)
+    return np.asarray(np.ceil(t_s / period_s) * period_s - t_s)
+
+
+def _by_whole_seconds(t_s: Array, rng: np.random.Generator) -> Array:
+    """Each for 50 messages."""
+    return np.repeat(rng.integers(0, 4, len(t_s) // 50 + 1), 50)[: len(t_s)] + rng.uniform(0.0, 0.03, len(t_s))
+
+
+def _with_stalls(t_s: Array, rng: np.random.Generator) -> Array:
+    late_s = np.zeros(len(t_s))
+    for begin_s, lasts_s in zip(rng.uniform(0.0, t_s[-1], 20), rng.uniform(0.5, 6.0, 20), strict=True):
+        within = (t_s >= begin_s) & (t_s < begin_s + lasts_s)
+        late_s[within] = begin_s + lasts_s - t_s[within]
+    return late_s
+
+
+@pytest.mark.parametrize("late_s", [_random, _in_bursts, _by_whole_seconds, _with_stalls])
+@pytest.mark.parametrize("hz", [1.0, 4.0, 10.0])
+def test_messages_that_come_late_are_no_leap(late_s: Callable[[Array, np.random.Generator], Array], hz: float) -> None:
+    """Also where they come in bursts, or overtake each other."""
+    fix = next(a.m for a in arrivals_of(run_of()) if isinstance(a.m, GnssPosition))
+    for seed in range(6):
+        clock, rng, t_s = SensorClock(), np.random.default_rng(seed), np.arange(0.0, 300.0, 1.0 / hz)
+        came_s = t_s + late_s(t_s, rng)
+        for n in np.argsort(came_s, kind="stable"):
+            m = replace(fix, stamp_ns=round(t_s[n] * 1e9), seq=int(n))
+            _, said = clock.take(m, int(came_s[n] * 100.0) * 10_000_000)
+            assert not said
+
+
+def test_a_leap_is_told_from_messages_that_take_longer_or_shorter() -> None:
+    """By up to 80 ms."""
+    clock, taken, rng = SensorClock(), list[Measurement](), np.random.default_rng(1)
+    fix = next(a.m for a in arrivals_of(run_of()) if isinstance(a.m, GnssPosition))
+    for n in range(100):
+        t_s = n / HZ
+        m = replace(fix, stamp_ns=round((t_s + (2.0 if n >= 50 else 0.0)) * 1e9), seq=n)
+        taken += clock.take(m, round(50.0 * (t_s + rng.uniform(0.0, 0.08))) * 20_000_000)[0]
+    assert [m.stamp_ns for m in taken] == [round(n / HZ * 1e9) for n in range(100)]
