@@ -13,12 +13,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 
 from graphloc import outputs
 from graphloc.cli._printed import counted
+from graphloc.config import load_config
 from graphloc.eval import report
 from graphloc.eval.simulate import Scenario, bl_scenario, simulate
 from graphloc.eval.simulate.bag import write_bag
+from graphloc.factors import KINDS
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.signals.thinning import THINNED
 from tests.commands import called
@@ -278,6 +281,26 @@ def test_sensors_and_config_are_listed(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert capsys.readouterr().out == written, (
         "docs/configuration.md: run `graphloc config --docs > docs/configuration.md`"
     )
+
+
+def test_a_configuration_is_printed_as_one_that_says_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was printed as JSON, which is no file of the product."""
+    given, printed = tmp_path / "vessel.yaml", tmp_path / "printed.yaml"
+    given.write_text(
+        "datum: {latitude_deg: 57.7, longitude_deg: 11.9, height_m: 40.0}\nsensors:\n  imu: {kind: imu, topic: /imu}\n"
+        "  '010': {kind: gnss, topic: /fix, sigma_scale: 1.0e-5, mount: {xyz_m: [1, 2, 3]}}\n"
+    )
+    assert called(monkeypatch, "config", "-c", given) == 0
+    printed.write_text(text := capsys.readouterr().out)
+    assert load_config(printed, KINDS) == load_config(given, KINDS)
+    assert "xyz_m: [1.0, 2.0, 3.0]" in text
+    assert (
+        text.index("kind: gnss") < text.index("topic: /fix") < text.index("sigma_scale:")
+    )  # as documented, not by the alphabet
+    assert called(monkeypatch, "config", "--json", "-c", given) == 0
+    assert json.loads(capsys.readouterr().out) == YAML(typ="safe", pure=True).load(text)
 
 
 def test_headings_that_were_only_too_close_together_are_counted_apart() -> None:

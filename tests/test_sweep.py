@@ -110,6 +110,23 @@ def test_what_cannot_run_is_one_line_before_anything_runs(
     assert not (tmp_path / "s").exists()
 
 
+@pytest.mark.parametrize(("given", "workers"), [([], 7), (["--jobs", "2"], 2)])
+def test_as_many_processes_as_cores(
+    given: list[str], workers: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of `ablate` and `drill`; it was one."""
+    taken = list[int]()
+    monkeypatch.setattr("os.cpu_count", lambda: 7)
+
+    def note(jobs: Sequence[Job], number: int, *_: object) -> Iterator[tuple[Job, list[Row]]]:
+        taken.append(number)
+        yield from ((job, [{"case": "", "error": "not run"}]) for job in jobs)
+
+    monkeypatch.setattr(sweep, "_on_dask", note)
+    called(monkeypatch, "sweep", "bl1-drift", "--set", "duration_s=6", *given, "-o", tmp_path / "s")
+    assert taken == [workers]
+
+
 def test_workers_give_what_this_process_gives(tmp_path: Path) -> None:
     """Every number but the time, offline to the last bit; a run that fails is a row, and the others go on."""
     jobs = [SHORT, BROKEN, replace(SHORT, seed=1, mode="online")]

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import json
 import re
+from io import StringIO
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -25,13 +26,25 @@ def sensors() -> None:
 def show_config(
     config: Annotated[Path | None, typer.Option("--config", "-c", help="A vessel.yaml to check.")] = None,
     docs: Annotated[bool, typer.Option("--docs", help="Print docs/configuration.md.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON, not as YAML.")] = False,
 ) -> None:
-    """Print the effective configuration of a vessel.yaml, or the reference of all keys."""
+    """Print the effective configuration of a vessel.yaml, as one, or the reference of all keys."""
+    from ruamel.yaml import YAML
+
     from graphloc._config_docs import render
     from graphloc.config import effective, load_config
     from graphloc.factors import KINDS
 
     if docs or config is None:
         typer.echo(render(KINDS), nl=False)
-    else:
-        typer.echo(json.dumps(effective(load_config(config, KINDS)), indent=2))
+        return
+    told = effective(load_config(config, KINDS))
+    if as_json:
+        typer.echo(json.dumps(told, indent=2))
+        return
+    writer: Any = YAML(typ="safe", pure=True)
+    writer.sort_base_mapping_type_on_output = False  # in the order of the keys' reference
+    writer.default_flow_style = None  # lists on a line
+    text = StringIO()
+    writer.dump(told, text)
+    typer.echo(text.getvalue(), nl=False)

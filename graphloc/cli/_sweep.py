@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphloc.cli._progress import progress
-from graphloc.cli._shared import HoldOutOption, OutOption, OverwriteOption, Stopped
+from graphloc.cli._shared import HoldOutOption, JobsOption, OutOption, OverwriteOption, Stopped
 
 if TYPE_CHECKING:
     from graphloc.job import Job
@@ -98,7 +99,7 @@ class CaseOptions:
 def sweep(
     options: CaseOptions,
     out: OutOption = Path("runs/sweep"),
-    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Parallel processes on this machine.")] = 1,
+    jobs: JobsOption = None,
     scheduler: Annotated[str, typer.Option(help="Use a Dask scheduler instead, e.g. tcp://host:8786.")] = "",
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -110,7 +111,8 @@ def sweep(
     options.check()
     cases = options.jobs()
     try:
-        table = run_sweep(cases, out, workers=jobs, scheduler=scheduler, overwrite=overwrite, progress=progress())
+        workers = jobs or os.cpu_count() or 1
+        table = run_sweep(cases, out, workers=workers, scheduler=scheduler, overwrite=overwrite, progress=progress())
     except KeyboardInterrupt:
         raise Stopped(f"{out} keeps the runs that are done; the same command goes on from there") from None
     typer.echo(summary(table))
