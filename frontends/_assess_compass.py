@@ -25,7 +25,7 @@ _MOST_COMPARED = 5000  # headings of a long run
 _GAP_S, _GAP = 2.0, 3.0  # between two headings, at least, and times what is usual: none came meanwhile
 _STRAIGHT_DEG = 20.0  # courses that turn by less tell no convention
 _ASKEW_DEG = 15.0  # antennas are mounted along a vessel or athwart, to this
-_BLOCK_S = 30
+_BLOCK_S = 30  # of which the middle is taken: waves and short turns average out, and a minute and a half tells a wander; a choice
 _SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
 _SIDEWAYS_DEG = 45.0  # to which scatter courses still tell by which quarter turn two antennas are mounted
 # Of a vessel that goes ahead and astern: least share of the courses either way; how often it turns back; share of the way it goes mostly.

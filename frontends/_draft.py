@@ -51,7 +51,7 @@ _FLOAT_S = 60.0
 _FILTERED = "by its name, or its messages, a filter's output: it has used the IMU already, and its errors are correlated, so it gets too much weight"
 _INS = "it tells its speed, as an INS or a filter does: it has used the IMU already, and its errors are correlated, so it gets too much weight"
 _MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; drivers may publish each packet
-_TURN_S = 0.1
+_TURN_S = 0.1  # of a LiDAR: nearly all turn ten times a second
 _MOST_PARTS = 100  # of a submap
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 

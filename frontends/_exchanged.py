@@ -16,7 +16,7 @@ from graphloc.time import NS_PER_S, stamps_of
 
 _HALF_S = 1.0  # of a chord
 _FEWEST = 20  # chords of a craft under way
-_MOVES_MPS = 0.5
+_MOVES_MPS = 0.5  # by the chord: over two seconds fixes of 0.3 m tell no direction below; a choice
 _CLEARLY = 0.3  # times what they differ by as they are read
 
 

@@ -22,7 +22,7 @@ _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset o
 _DIFFERS = 1.5  # times the default of a slow error
 # Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
 _RTK_M = (0.05, 0.1)
-_RTK_SCATTER_M = 0.1
+_RTK_SCATTER_M = 0.1  # RTK scatters by less, DGPS, which has the same status, by more; a choice
 FITS_WITH_FIXES = "what the IMU feels fits the motion of the fixes in the same messages"
 """Why the stamps of a heading, or a velocity, are late, where it does not tell that itself."""
 WATER = " (through water)"

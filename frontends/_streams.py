@@ -177,7 +177,7 @@ def _said_row(said: Said) -> Row:
             return (said.v_mps[0], -said.v_mps[1], -said.v_mps[2])
 
 
-_MOST = 1e12
+_MOST = 1e12  # no measurement in SI units, geodetic or of a map grid is larger
 
 
 @dataclass(slots=True)

@@ -22,7 +22,7 @@ from graphloc.frontends.source import TF_MOVING, TF_STATIC, RawMessage
 WORLD_NAMES = ("map", "odom", "world", "earth", "utm", "camera_init")  # the last by LOAM
 _BODY_NAMES = ("base_link", "base_footprint", "body", "base", "vessel", "vehicle", "boat")
 
-_FARTHEST_M = 1e4
+_FARTHEST_M = 1e4  # no vessel is as long: such a transform is damaged, or of a map
 _OLD_TF = "tf/msg/tfMessage"  # of ROS 1 before tf2
 _DENSE = 1000  # messages of /tf; after n times as many, one in n is read: an hour may hold a million
 _GOLDEN = 0.6180339887498949  # its multiples leave no gap, whatever order frames are published in

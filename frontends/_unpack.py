@@ -21,7 +21,7 @@ MOST_BYTES = 1 << 30
 """Most that a chunk or message may unpack to. Recorders make chunks of about 1 MB; a message is in one piece."""
 _MOST_TIMES = 200
 """A whole file may unpack to so many times its size, or to `MOST_BYTES`: recordings shrink 2 to 50 times."""
-_MOST_KEPT = 1 << 26
+_MOST_KEPT = 1 << 26  # bytes, 64 MiB; a choice
 _zstd = storage_mcap.zstd
 
 

@@ -18,7 +18,7 @@ from graphloc.frontends.turning import Turning
 from graphloc.signals.series import integral
 from graphloc.time import NS_PER_S
 
-_BLOCK_S = 20.0
+_BLOCK_S = 20.0  # within which gyroscope bias and deviation hardly change, see `heading_time_offset`
 _CLEAR, _HINT, _LEAST_S = 4.0, 2.0, 0.02  # sigmas, s
 _BY_CHANCE = 5e-3  # a few blocks that agree by chance look like many
 _APART_S, _LEAST_OF_WAY_S = 0.05, 0.1  # how closely is looked; from which it is said

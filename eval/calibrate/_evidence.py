@@ -21,7 +21,7 @@ from graphloc.offsets import Offset, Offsets
 
 Name = tuple[str, Offset]
 
-_BLOCK_S = 10.0
+_BLOCK_S = 10.0  # within which residuals go together, as errors last for seconds: each block is one piece of evidence; a choice
 CLEAR = 4.0  # sigmas from which an offset is believed to be wrong: some ten are looked at in each run
 LEAST: dict[Offset, float] = {"x": 0.05, "y": 0.05, "yaw": float(np.radians(0.5)), "time": 0.01}
 _AS_WELL, _EXPLAINS = 0.95, 0.8  # shares of the drop of the cost from which another offset explains the run, too

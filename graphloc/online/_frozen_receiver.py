@@ -17,7 +17,7 @@ from graphloc.frames import Array
 WINDOW_S, _FEWEST = 4.0, 4  # seconds and fixes that a decision is made from
 _LEAST_MPS = 0.7  # no multipath drifts so fast
 _SHARE = 0.5  # of the vessel's speed: with late stamps the error also grows in a turn, but by less
-_SIGMAS = 4.0
+_SIGMAS = 4.0  # of its own noise: so far a receiver that stands may seem to move, and an error to grow; a choice
 # Measured by the receiver: if it moves in another way, it may be right and the estimate wrong.
 _STANDS_MPS, _STANDS_M = 0.3, 0.5
 _LONGEST_S = 15.0  # for which its disagreement does not count against the estimate

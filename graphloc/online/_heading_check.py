@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Does the heading fit the motion? The accelerations, rotated by the estimate, must move the antenna as its fixes do.
 
-Over 40 s, with places as complex numbers, east + i north:
+Over 40 s, horizontal vectors as complex numbers, east + i north:
 
-    z(t) = a + b t + c t^2 + d t^3 + f x2(t) + g x3(t) + h x1(t) + rho s(t)
+    place(t) = a + b t + c t^2 + d t^3 + f ahead2(t) + g ahead3(t) + h ahead(t) + rho reckoned(t)
 
-s: the specific force in axes propagated by the gyroscope, integrated twice, plus the lever arm; x1, x2, x3: exp(i yaw), as it is,
-integrated twice and three times. h: where the antenna is off its mount, while the heading is a guess that bends its estimate. a, b: position and velocity; c, d: gravity, by a tilt that is wrong or changes; f, g: biases of the
-accelerometer and the gyroscope, about 0 and not about the estimated ones, which are wrong too where the heading is. With the
-right heading rho = 1; a heading that is off by e gives rho = exp(-i e). A gyroscope bias of 0.02 rad/s about the vertical turns
-s by 0.8 rad in 40 s: where the heading fits with the estimated bias taken off, nothing is reported. So a compass with a wrong
-mount or convention is told from a vessel that moves astern, sideways or with a current: there the accelerations fit the motion.
-The course over ground cannot tell these apart. Where the fixes jump, z has a step. Fixes that are late turn z where the vessel
-turns, by what it turns meanwhile: where their stamps may be off (`stamp_sigma_s`), and the heading fits with a term in the
-velocity of s, nothing is reported.
+place: of the antenna, by its fixes. reckoned: the same by dead reckoning: the specific force in axes propagated by the
+gyroscope, integrated twice, plus the lever arm. ahead, ahead2, ahead3: exp(i yaw), as it is, integrated twice and three
+times. h: where the antenna is off its mount, while the heading is a guess that bends its estimate. a, b: position and
+velocity; c, d: gravity, by a tilt that is wrong or changes; f, g: biases of the accelerometer and the gyroscope, about 0 and
+not about the estimated ones, which are wrong too where the heading is. With the right heading rho = 1; a heading that is off
+by e gives rho = exp(-i e). A gyroscope bias of 0.02 rad/s about the vertical turns what is reckoned by 0.8 rad in 40 s: where
+the heading fits with the estimated bias taken off, nothing is reported. So a compass with a wrong mount or convention is told
+from a vessel that moves astern, sideways or with a current: there the accelerations fit the motion. The course over ground
+cannot tell these apart. Where the fixes jump, place has a step. Fixes that are late turn it where the vessel turns, by what
+it turns meanwhile: where their stamps may be off (`stamp_sigma_s`), and the heading fits with a term in the velocity of what
+is reckoned, nothing is reported.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from graphloc.solve.covariances import world_covariance
 from graphloc.time import stamps_of
 from graphloc.trajectory import bounds_95
 
+# In 40 s most vessels turn or change their speed; over longer ones biases bend what is reckoned by more. Every 5 s; choices.
 _WINDOW_S, _EVERY_S = 40.0, 5.0
 _LONGEST_STEP_S = 1.0  # of the IMU; in a longer gap the accelerations are unknown
 _TURNED_RAD, _KNOWN_DEG = np.radians(20.0), 20.0  # reported from this error on, where the 95 % bound is smaller
@@ -40,10 +43,11 @@ _SIGMAS = 3.0  # and from so many sigmas of the check itself on
 _SIZE, _SURE = (0.7, 1.4), 0.2  # |rho| is near 1 unless fixes jump; largest sigma of rho
 _LIKELY = 2.5  # sigmas of rho: so far from 0, and no farther from 1, it says something of the heading
 _APART_S = 1.0  # correlation time of the errors of fixes, at least
-_FEWEST = 15  # fixes
+_FEWEST = 15  # fixes, for up to 15 real unknowns of four terms, three biases, rho and a jump; a choice
 _ENDS = slice(2, -2)  # fixes at which a jump would show
 _IN_A_ROW = 2  # checks that must agree before the heading is called wrong, or right again
 _LATE_S = 0.5  # 1 sigma of a delay of fixes whose stamps may be off: those that come through a gateway are by a second
+_COMPLEX = np.array([1.0, 1j])  # of a horizontal vector: east + i north
 _BIASES = np.array([0.1, 9.8 * 0.005])  # 1 sigma: m/s^2, and of the rate that tilts gravity, m/s^3
 
 
@@ -202,52 +206,60 @@ class HeadingCheck:
         """
         # What measures whole poses has no antenna.
         place_m = getattr(lag.problem.streams[self._sensor].config, "mount_sigma_m", 0.0) if any_place else 0.0
-        at_s, felt = self._felt(lag, newest, drift_radps, place_m)
-        known = np.append(_BIASES, [place_m] if place_m else [])
+        at_s, regressors = self._reckoned(lag, newest, drift_radps, place_m)
+        prior_sigmas = np.append(_BIASES, [place_m] if place_m else [])
         if late:
-            felt, known = np.vstack([felt, np.gradient(felt[0], at_s)]), np.append(known, _LATE_S)
+            regressors = np.vstack([regressors, np.gradient(regressors[0], at_s)])
+            prior_sigmas = np.append(prior_sigmas, _LATE_S)
         fixes = [fix for fix in self._fixes if self._steps[0].until_ns <= fix.stamp_ns <= newest.stamp_ns]
         if at_s[-1] - at_s[0] < 0.9 * _WINDOW_S or len(fixes) < _FEWEST:
             return None
         stamps_ns = stamps_of(fixes)
-        places = np.array([fix.p_world_m for fix in fixes])
-        t, z = (stamps_ns - newest.stamp_ns) * 1e-9, places @ np.array([1.0, 1j])
-        rows = [np.interp(t, at_s, row.real) + 1j * np.interp(t, at_s, row.imag) for row in felt]
-        jumped_ns, _ = position_jumps(stamps_ns, places, np.array([fix.sigma_m for fix in fixes]), allowed_m=0.0)
-        since = (stamps_ns[:, None] >= jumped_ns).astype(float)
-        model = np.hstack([np.vander(1.0 + 2.0 * t / _WINDOW_S, 4), since])
-        rows, z, model = [row[_ENDS] for row in rows], z[_ENDS], model[_ENDS]
-        basis, _ = np.linalg.qr(model)
-        free = np.column_stack([z, *rows])
-        free = free - basis @ (basis.T @ free)
-        moved, terms = free[:, 0], free[:, 1:]
-        left = moved - terms @ np.linalg.lstsq(terms, moved, rcond=None)[0]
-        variance = float(np.mean(np.abs(left) ** 2)) * len(z) / (_WINDOW_S / _APART_S)  # of a fix, as all go together
-        information = terms.conj().T @ terms / variance + np.diag([0.0, *(1.0 / known**2)])
-        rho = complex(np.linalg.solve(information, terms.conj().T @ moved / variance)[0])
+        places_m = np.array([fix.p_world_m for fix in fixes])
+        fix_s, place = (stamps_ns - newest.stamp_ns) * 1e-9, places_m @ _COMPLEX
+        at_fixes = [np.interp(fix_s, at_s, row.real) + 1j * np.interp(fix_s, at_s, row.imag) for row in regressors]
+        jumps_ns, _ = position_jumps(stamps_ns, places_m, np.array([fix.sigma_m for fix in fixes]), allowed_m=0.0)
+        after_jump = (stamps_ns[:, None] >= jumps_ns).astype(float)
+        nuisance = np.hstack([np.vander(1.0 + 2.0 * fix_s / _WINDOW_S, 4), after_jump])
+        basis, _ = np.linalg.qr(nuisance[_ENDS])
+        columns = np.column_stack([place, *at_fixes])[_ENDS]
+        columns = columns - basis @ (basis.T @ columns)  # what no cubic and no step explains
+        observed, design = columns[:, 0], columns[:, 1:]
+        residual = observed - design @ np.linalg.lstsq(design, observed, rcond=None)[0]
+        independent = _WINDOW_S / _APART_S  # fixes closer together share their errors
+        variance = float(np.mean(np.abs(residual) ** 2)) * len(observed) / independent
+        information = design.conj().T @ design / variance + np.diag([0.0, *(1.0 / prior_sigmas**2)])
+        rho = complex(np.linalg.solve(information, design.conj().T @ observed / variance)[0])
         sigma = float(np.sqrt(np.linalg.inv(information)[0, 0].real))
         return Fit(rho, sigma)
 
-    def _felt(self, lag: Lag, newest: Newest, drift_radps: Array, place_m: float) -> tuple[Array, Array]:
-        """Return times (N,), s, relative to the newest state, and s, x2, x3 and, with a `place_m`, x1 (3 or 4, N), complex, in world.
+    def _reckoned(self, lag: Lag, newest: Newest, drift_radps: Array, place_m: float) -> tuple[Array, Array]:
+        """Dead-reckon the antenna by the steps of the IMU, from rest.
 
         Args:
             drift_radps: as in `_fit`. place_m: how far from its mount the antenna may be, 1 sigma; 0: it is where the window has it.
+
+        Returns:
+            times (N,), s, relative to the newest state; reckoned, ahead2, ahead3 and, with a `place_m`, ahead (3 or 4, N), complex, in
+            world as the newest state has the attitude.
         """
-        lever = _mount_m(lag, self._sensor) if place_m else _lever_m(lag, self._sensor)
-        R, v, p, places, ahead = np.eye(3), np.zeros(3), np.zeros(3), [], []
+        lever_m = _mount_m(lag, self._sensor) if place_m else _lever_m(lag, self._sensor)
+        # In the body's axes at the first step ("start"), without gravity.
+        R_start_body, v_mps, p_m = np.eye(3), np.zeros(3), np.zeros(3)
+        antenna_m, bow = [], []
         for step in self._steps:
             dt_s = (step.until_ns - step.from_ns) * 1e-9
-            p, v = p + v * dt_s + R @ step.dp, v + R @ step.dv
-            R = R @ step.dR @ gtsam.Rot3.Expmap(-drift_radps * dt_s).matrix()
-            places.append(p + R @ lever)
-            ahead.append(R[:, 0])
-        in_world = newest.pose.rotation().matrix() @ R.T
-        place, x = (np.array(of) @ in_world[:2].T @ np.array([1.0, 1j]) for of in (places, ahead))
-        dt = np.array([step.until_ns - step.from_ns for step in self._steps]) * 1e-9
-        twice = np.cumsum(np.cumsum(x * dt) * dt)
+            p_m, v_mps = p_m + v_mps * dt_s + R_start_body @ step.dp, v_mps + R_start_body @ step.dv
+            R_start_body = R_start_body @ step.dR @ gtsam.Rot3.Expmap(-drift_radps * dt_s).matrix()
+            antenna_m.append(p_m + R_start_body @ lever_m)
+            bow.append(R_start_body[:, 0])
+        R_world_start = newest.pose.rotation().matrix() @ R_start_body.T
+        reckoned, ahead = (np.array(vectors) @ R_world_start[:2].T @ _COMPLEX for vectors in (antenna_m, bow))
+        step_s = np.array([step.until_ns - step.from_ns for step in self._steps]) * 1e-9
+        ahead_twice = np.cumsum(np.cumsum(ahead * step_s) * step_s)
+        ahead_thrice = np.cumsum(ahead_twice * step_s)
         at_s = (np.array([step.until_ns for step in self._steps]) - newest.stamp_ns) * 1e-9
-        return at_s, np.array([place, twice, np.cumsum(twice * dt), *([x] if place_m else [])])
+        return at_s, np.array([reckoned, ahead_twice, ahead_thrice, *([ahead] if place_m else [])])
 
 
 def _mount_m(lag: Lag, receiver: str) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphloc.frames import Array
 
-_LEAN_S = 5.0
+_LEAN_S = 5.0  # time constant with which its tilt follows the estimate's; a choice
 _LEAN_RAD = 2e-3  # at most, in a step: no jump
 _FLOOR = np.diag([1e-6] * 3 + [1e-8] * 3)  # of a step: errors of the integration itself
 

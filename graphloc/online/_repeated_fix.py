@@ -33,7 +33,7 @@ from graphloc.time import NS_PER_S
 _SAME_M, _AWAY_M = 0.2, 1.0  # of one place; how far the vessel has gone by then, unless a fix equals the one before
 _SIGMAS = 3.0  # of the estimated speed
 _SHARE = 0.5  # of the speed before, by the fixes and as estimated: below that the vessel brakes
-_KEPT = 200
+_KEPT = 200  # so that memory stays bounded: ten seconds of a receiver at 20 Hz; a choice
 
 
 class RepeatedFixDetector:

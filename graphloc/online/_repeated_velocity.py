@@ -11,7 +11,7 @@ from graphloc.frames import Array
 from graphloc.signals.frozen_receiver import MANY, MOSTLY, REST_MPS
 
 _RUNS = 20  # velocities after which it is known whether they are rounded
-_KEPT = 200
+_KEPT = 200  # as in `_repeated_fix`
 
 
 class RepeatedVelocityDetector:

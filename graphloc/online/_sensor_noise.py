@@ -13,7 +13,7 @@ from graphloc.online._lag import Lag
 from graphloc.solve.sensor_noise import Pair, pairs_of, times_stated
 from graphloc.solve.warnings import scale_warning
 
-_EVERY_S = 5.0
+_EVERY_S = 5.0  # between two looks, to save time: a factor is that of a minute or more of pairs; a choice
 _SETTLED_S = 1.5  # after so long a measurement has been judged again
 _REMEMBERED = 100  # pairs
 # Of the pairs since the last look, so that the remembered ones are of a minute or more: ten seconds of multipath are as many pairs of a

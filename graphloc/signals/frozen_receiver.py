@@ -36,8 +36,8 @@ WHY_VELOCITY = "frozen receiver or driver: it repeats one velocity bit for bit"
 HELD_S, FEWEST = 2.5, 3
 _NOISE_M = 0.5  # how far the fixes of one position may scatter
 BEFORE_S = 3.0  # before the stretch: the fixes in it give the speed
-_SIGMAS = 3.0
-UNDER_WAY_MPS = 0.5
+_SIGMAS = 3.0  # of a speed, by which it must exceed what it is compared with
+UNDER_WAY_MPS = 0.5  # a moored vessel surges and swings by less, and fixes at rest drift by less; a choice
 _JUMP_M, _SHARE = 2.0, 0.5  # the jump after, and its share of the way at the speed before
 _FAR_M = 20.0  # a jump that may be of a vessel that has turned back meanwhile, or multipath at rest
 # Of a velocity: share of the values that are not repeated, else it is rounded; repetitions that are too many; at rest it may.

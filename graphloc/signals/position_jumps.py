@@ -36,7 +36,7 @@ _BURST_S = 1.0  # fixes that are off for no longer are outliers
 # do so little by little.
 _BESIDE_S, _FEWEST_BESIDE, _SLOW_S, _OFF_SIGMAS, _OFF_M, _AT_ONCE = 2.0, 3, 2.5, 8.0, 1.0, 0.5
 _GAP = 3.0  # times the usual time between fixes
-_KEPT = 200
+_KEPT = 200  # so that memory stays bounded: ten seconds of a receiver at 20 Hz; a choice
 _FITS_SIGMAS, _CERTAIN_SIGMAS = 5.0, 8.0  # off a prediction
 _SAME, _SAME_SIGMAS = 0.25, 3.0  # off a prediction by the same: within this share and so many sigmas
 _ENDS = 10.0  # odds that a jump is over

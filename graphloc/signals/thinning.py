@@ -10,7 +10,9 @@ from graphloc.time import NS_PER_S
 LEAST_APART_NS = 45_000_000
 """Between two fixes, velocities or headings of a fast sensor that are used: 20 a second stay, though steps between their stamps are up to 5 ms short."""
 THINNED = f"less than {LEAST_APART_NS / 1e6:.0f} ms after the one before: its error is correlated for longer than this, so it adds no information"
-_RATE_OVER_NS = 2 * NS_PER_S
+_RATE_OVER_NS = (
+    2 * NS_PER_S
+)  # what comes in bursts is no fast sensor: the rate is that over longer than a burst; a choice
 
 
 class Thinning:

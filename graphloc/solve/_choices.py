@@ -38,7 +38,7 @@ _STRETCH_S, _STRETCH_MARGIN = 8.0, 0.5
 _SURE = 0.7  # a hypothesis judged by the rest alone is believed from here on
 # Surroundings on which another choice of hypotheses is tried.
 _AROUND_S = 20.0
-_AROUND_PASSES = 6
+_AROUND_PASSES = 6  # at most; they end where choices and places settle. A choice, as many as of a level (`_levels`)
 
 
 def other_choices(

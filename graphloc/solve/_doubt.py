@@ -38,7 +38,7 @@ _SAID = 0.05  # beyond this one a bound that holds for 95 % depends on what else
 _LONG = 0.1  # share of a run, from which that is said
 _BEYOND = 0.05  # share of the cases that a bound leaves out
 _BOUND = -float(special.ndtri(0.5 * _BEYOND))  # sigmas
-_HALVINGS = 40
+_HALVINGS = 40  # of the interval that holds the bound: to 1e-12 of it
 _STRETCH = 4.0  # lengths of correlation: half of it is kept away from, and errors are 0.14 alike there
 _PLANE = np.array([0, 1, 5])  # x, y and yaw in a covariance
 # Which of these three; a row of boats leaves the one open and not the other.

@@ -25,7 +25,7 @@ from graphloc.solve.stretch import (
 from graphloc.solve.wrong_imu import GrownWindow, ImuWrong, wrong_span
 
 _CHUNK_S, _OVERLAP_S = 15.0, 5.0
-_SETTLED_M = 0.5
+_SETTLED_M = 0.5  # coarse, to save rounds: passes over the whole run follow, which end at `_passes.SETTLED_M`; a choice
 _MAX_ROUNDS, _MAX_FAR_ROUNDS, _FAR_SETTLED_M = 2, 8, 2.0
 _MOSTLY = 0.7  # share of a sensor's measurements; by the usual kernel 87 % of right ones agree
 

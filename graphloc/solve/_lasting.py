@@ -17,7 +17,7 @@ from graphloc.frames import Array
 from graphloc.solve.decide import AGREES, Verdict
 from graphloc.time import NS_PER_S, stamps_of
 
-_FEWEST = 30
+_FEWEST = 30  # positions: of fewer only correlations of 0.7 and more are `_SURE` (4 / sqrt(30))
 _LEAST = 0.3  # correlation from one to the next: bounds are then a third too small, or more
 _SURE = 4.0  # sigmas of the correlation of as many independent ones
 

@@ -32,7 +32,7 @@ _JUMP = 1.0  # sigmas from one node to the next: ten times the drift
 _FAR = 2.0  # sigmas: nearer, the error is at its usual level
 # Each level after each outage is another solution of the whole run.
 _MOST_OUTAGES, _MOST_LEVELS, _TRIAL_PASSES = 4, 3, 6
-OUTAGE_S = 10.0
+OUTAGE_S = 10.0  # after a shorter one dead reckoning is a metre off or less (E.dark), and bends nothing; a choice
 COMES_BACK_OFF = 6.0  # nats: of a receiver that does after an outage
 
 

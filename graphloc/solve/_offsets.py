@@ -33,7 +33,7 @@ from graphloc.solve.batch import BatchResult
 from graphloc.solve.imu_noise import imu_misfit
 from graphloc.solve.linearised import Rows, linearised, normal_solver, with_left_out
 
-BLOCK_S = 2.0
+BLOCK_S = 2.0  # over which residuals are summed; `eval/calibrate` puts these together to 10 s, as errors last; a choice
 # Rounds of choosing weights; they end early where the weights, or theta (in sigmas), change little.
 _ROUNDS, _SAME_WEIGHT, _SAME = 6, 0.2, 0.1
 # How far an offset may be off while weights are chosen, 1 sigma: m, rad, s.

@@ -9,7 +9,7 @@ import gtsam
 
 from graphloc.errors import not_solved
 
-_ABSOLUTE_TOL = 1e-3
+_ABSOLUTE_TOL = 1e-3  # nats of the cost: choices hang on whole ones; a choice
 _AS_PROMISED = 0.1  # of the tolerance: agreement with the linear model
 _HOPELESS = 1e6  # times the initial cost: full steps do not recover from there
 

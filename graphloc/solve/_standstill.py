@@ -14,7 +14,7 @@ from graphloc.signals.series import runs
 from graphloc.time import duration_ns
 
 _STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine running
-_STILL_SPEED_MPS = 0.15
+_STILL_SPEED_MPS = 0.15  # by the fixes, besides what their noise makes: a moored vessel surges on its lines; a choice
 _FEWEST_HEADINGS = 4  # of a standstill, that show a turn
 _BLOCK_S, _SWELL_S = 0.5, 10.0
 

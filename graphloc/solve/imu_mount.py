@@ -33,7 +33,7 @@ from graphloc.solve._passes import Settled, cost_of_run, settle
 from graphloc.solve.decide import Stage, Verdicts, weigh
 from graphloc.solve.linearised import linearised, normal_solver, sparse_rows, with_left_out
 
-_ROUNDS = 3
+_ROUNDS = 3  # of turning the IMU and solving again, at most: they end where what is left is below `_MATTERS`; a choice
 _MATTERS, _TOLD = 0.5, 1.5  # sigmas of the mount, and of what is known of it: less is in the bounds
 _MOST = 5.0  # sigmas of the mount: what speaks for more is another error
 

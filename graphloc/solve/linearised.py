@@ -20,7 +20,7 @@ from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision
 from graphloc.solve.decide import Verdicts
 
-_LEAST_WEIGHT = 1e-6
+_LEAST_WEIGHT = 1e-6  # as of a linear factor (`linear.linear_update`), so that no row vanishes
 
 
 class Weighed(NamedTuple):

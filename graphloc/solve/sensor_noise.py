@@ -29,7 +29,7 @@ _FACTORS = np.geomspace(1.0, 20.0, 16)
 _SHARES = np.linspace(0.3, 0.95, 8)
 _ERRORS = (0.2, 0.4, 0.8, 1.6, 3.2)  # times the error that is expected of a false one
 _ANY_SIZE = 0.1  # share of the others that err by any of these sizes, and not by the one of most
-_LEAST_TIMES = 1.4
+_LEAST_TIMES = 1.4  # so the first of `_FACTORS` above 1, 1.22, is none: stated sigmas are rarely better known; a choice
 _SURE = 8.0  # log-likelihood that a factor must gain
 _SURE_IF_DENIED = 0.0  # where the IMU contradicts the sensors: half a minute of fixes tells no more, and else it would be called noisier
 

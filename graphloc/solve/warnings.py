@@ -27,10 +27,10 @@ from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE, too_quiet
 from graphloc.time import NS_PER_S, stamps_of, utc_text
 
 _TURNED, _TOLD = 2.5, 0.1  # sigmas; share of a prior's variance
-_MUCH_NOISIER = 1.5
+_MUCH_NOISIER = 1.5  # times what is stated, from which it is said: bounds would be a third too small; a choice
 _SMALL_M = 0.1  # a slow error below it is that of RTK
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
-_BY_CHANCE = 1e-3
+_BY_CHANCE = 1e-3  # anywhere in the run; a choice
 _UNAIDED_S = 30.0  # at an end of the run, from which the IMU alone is metres off
 _LEVELS_M = 0.5  # sigma, for levels that may be the usual ones as well: said from there on
 
