@@ -7,10 +7,9 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import islice
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +20,12 @@ from graphloc.frontends._assess import (
     Courses,
     MeasuredMotion,
     courses_of,
-    evenly,
     gnss_report,
     motion_of_places,
-    on_one_clock,
     sane,
     topic_report,
     track,
     vec,
-    without_drift,
 )
 from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
 from graphloc.frontends._assess_imu import felt_of, imu_report, series_of, turned_as_its_heading
@@ -37,18 +33,8 @@ from graphloc.frontends._assess_receivers import apart, apart_warning, height_wa
 from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_wander import changes, way_of
 from graphloc.frontends._assess_world import in_map_grid, world_of
-from graphloc.frontends._clock import (
-    FEWEST_STAMPS,
-    GAIN_LIMIT_S,
-    ClockStep,
-    leaps,
-    recorder_set,
-    refuse_woven,
-    steady_logs,
-    step,
-    usual_latency_s,
-    without_leaps,
-)
+from graphloc.frontends._clock import usual_latency_s
+from graphloc.frontends._contents import Contents, contents_of
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
 from graphloc.frontends._reports import (
@@ -59,7 +45,6 @@ from graphloc.frontends._reports import (
     GnssReport,
     ImuReport,
     Inspection,
-    MountedTopic,
     MountGuess,
     OdometryReport,
     TopicReport,
@@ -67,11 +52,11 @@ from graphloc.frontends._reports import (
     VelocityReport,
     filtered,
 )
-from graphloc.frontends._streams import Sentences, TopicData, read_streams
-from graphloc.frontends._tf import WORLD_NAMES, Pose, StaticTree
+from graphloc.frontends._scanners import cameras_of, lidars_of
+from graphloc.frontends._streams import TopicData
+from graphloc.frontends._tf import Pose
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
 from graphloc.frontends._unused import unread_lidars, unread_tags, unused_magnetometers, unused_numbers, unused_topics
-from graphloc.frontends.aerial.cloud import CLOUDS
 from graphloc.frontends.decode import (
     GPS_FIXES,
     IMU,
@@ -84,20 +69,14 @@ from graphloc.frontends.decode import (
     POSE,
     QUATERNION,
     TWIST,
-    UNSTAMPED,
     VECTOR,
-    header_stamp_ns,
 )
-from graphloc.frontends.source import Bag, TopicSummary
-from graphloc.frontends.tags.listed import LISTS
-from graphloc.frontends.tags.sightings import IMAGES, INFO, camera_info_topic, is_rectified
 from graphloc.frontends.time_offsets import MotionOffset, heading_time_offset, later_than, motion_time_offset
 from graphloc.frontends.turning import Turning
 from graphloc.measurements import CompassHeading
 from graphloc.signals.frozen_receiver import frozen_fixes
-from graphloc.signals.pauses import common_pauses, pauses_warning
 from graphloc.signals.white_noise import white_noise
-from graphloc.time import NS_PER_S, seconds_between
+from graphloc.time import NS_PER_S
 
 __all__ = [
     "CompassReport",
@@ -114,16 +93,10 @@ __all__ = [
 ]
 
 _FIXES = (NAV_SAT_FIX, *GPS_FIXES)
-_MOST_TRIED = 200  # messages of a topic that cannot be decoded
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
-# Clouds that were made of another one; those of depth cameras and radars.
-_DERIVED = re.compile(r"filter|crop|voxel|sampl|ground|cluster|segment|obstacle|register|skew|second", re.IGNORECASE)
 _AS_NOISY = 1.5  # gyro noise, times that of the least noisy IMU, up to which one is as good
-_NO_LIDAR = re.compile(r"depth|radar|stereo", re.IGNORECASE)
-_LOOKS_AHEAD_DEG = np.array([-90.0, 0.0, -90.0])  # of an optical frame
 _DOWN = np.diag([1.0, -1.0, -1.0])  # to axes ahead, to port, up from such ahead, to starboard, down
 _BELOW_M, _ALIKE = 0.05, 0.9  # antennas in tf, from which its z points down; cosine between axes taken for the same
-_SKY = 0.7  # upward part of an optical axis, from which no tag is seen
 _MOST_NAMED = 6
 _FAR_BEYOND = 3.0  # times as far as another one's height wanders
 _SAME_M = 0.05  # by which two topics of one receiver wander against each other at most
@@ -131,47 +104,6 @@ _SAME_WAY_S = 0.1  # within which messages of one device are recorded after thei
 _FEWEST = 20  # places of a track
 # Of the run, from which a receiver is there throughout; of the fixes, from which it says as much as another.
 _COVERS = 0.8
-
-
-class _First(NamedTuple):
-    """First readable message of a topic: its frame, and recording time minus stamp, s; None: it has no stamp."""
-
-    frame: str
-    latency_s: float | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Contents:
-    """What is read of a bag.
-
-    Attributes:
-        source: its name, for messages. topics: by name, from its index.
-        streams: by topic, as recorded. aligned: those with messages, on one clock.
-        tree: of tf. sentences: what NMEA tells beside the streams. lidars, cameras, infos (their CameraInfos): by topic.
-    """
-
-    source: str
-    topics: Mapping[str, TopicSummary]
-    streams: Mapping[str, TopicData]
-    aligned: Mapping[str, TopicData]
-    tree: StaticTree
-    sentences: Sentences
-    lidars: Mapping[str, _First]
-    cameras: Mapping[str, _First]
-    infos: Mapping[str, _First]
-    warnings: tuple[str, ...]
-
-    def of_type(self, *msgtypes: str) -> list[TopicData]:
-        """Return the aligned streams of some message types."""
-        return [stream for stream in self.aligned.values() if stream.msgtype in msgtypes]
-
-    def tf_pose(self, stream: TopicData) -> Pose | None:
-        """Return T_body_sensor of a stream where tf connects its frame with the body."""
-        return self.tree.resolve(self.tree.body(), stream.frame_id) if stream.frame_id in self.tree.frames else None
-
-    def tf_frame(self, stream: TopicData) -> str | None:
-        """Return the frame of a stream where tf connects it with the body."""
-        return None if self.tf_pose(stream) is None else stream.frame_id
 
 
 _Late = Mapping[str, tuple[float, float] | None]  # by receiver, as `GnssReport.late_s`
@@ -198,7 +130,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     Raises:
         InputError: the bag cannot be opened, or its parts overlap in time.
     """
-    bag = _read(paths)
+    bag = contents_of(paths)
     tree, body = bag.tree, bag.tree.body()
     gnss = _gnss_reports(bag)
     reference = _best_track(bag, gnss)
@@ -240,8 +172,8 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
         compasses=compasses,
         odometry=tuple(reports),
         velocities=tuple(_timed_velocity(report, late.get(report.topic), together) for _, report in velocities),
-        lidars=_lidars(bag),
-        cameras=_cameras(bag),
+        lidars=lidars_of(bag),
+        cameras=cameras_of(bag),
         tf_frames=tree.frames,
         body_frame=body,
         in_body={frame: _turned(pose) for frame in tree.frames if (pose := tree.resolve(body, frame))} if down else {},
@@ -259,41 +191,7 @@ def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
     )
 
 
-def _read(paths: Path | str | Sequence[Path | str]) -> _Contents:
-    with Bag(paths) as bag:
-        topics = bag.topics
-        bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
-        streams, tree, sentences = read_streams(bag)
-        lidars = _firsts_of(bag, [t.topic for t in topics.values() if set(CLOUDS) & set(t.msgtypes) and t.messages])
-        cameras = _firsts_of(bag, _pictures(bag))
-        infos = _firsts_of(
-            bag, [t.topic for t in topics.values() if INFO in t.msgtypes and t.messages] if cameras else []
-        )
-        source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
-    recorder = next((at for s in streams if (at := recorder_set(s.stamps_ns, s.logs_ns))), None)
-    if recorder is not None:
-        warnings += (recorder.said_of_recorder,)
-        streams = [s.logged(steady_logs(s.stamps_ns, s.logs_ns)) for s in streams]
-    streams, said_of_leaps = _without_leaps(streams)
-    warnings += said_of_leaps
-    streams = [evenly(s) if s.msgtype == IMU and len(s) else s for s in without_drift(streams)]
-    for stream in streams:
-        if stream.msgtype == IMU:
-            refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)
-    steps = _clock_steps(streams)
-    warnings = (*warnings, *(at.said(topic) for topic, at in steps.items()))
-    imu = next((s for s in streams if s.msgtype == IMU and len(s)), None)
-    if imu is not None:
-        said = pauses_warning(common_pauses(np.sort(imu.stamps_ns), (s.stamps_ns for s in streams if s is not imu)))
-        warnings = (*warnings, *([said] if said else []))
-    return _Contents(
-        source=source, topics=topics, streams={s.topic: s for s in streams},
-        aligned={s.topic: s for s in on_one_clock([_as_mostly_set(s, steps) for s in streams if len(s)])},
-        tree=tree, sentences=sentences, lidars=lidars, cameras=cameras, infos=infos, warnings=warnings,
-    )  # fmt: skip
-
-
-def _topic_reports(bag: _Contents) -> tuple[TopicReport, ...]:
+def _topic_reports(bag: Contents) -> tuple[TopicReport, ...]:
     """Report every topic of the bag, then every NMEA sentence."""
     streams = {name.removesuffix(FILTER): stream for name, stream in bag.streams.items()}
     topics = [
@@ -315,7 +213,7 @@ def _topic_reports(bag: _Contents) -> tuple[TopicReport, ...]:
     return (*topics, *sentences)
 
 
-def _gnss_reports(bag: _Contents) -> list[GnssReport]:
+def _gnss_reports(bag: Contents) -> list[GnssReport]:
     """Report the receivers, the best one first."""
     found = [r for s in bag.of_type(*_FIXES) if (r := gnss_report(bag.streams[s.topic], bag.tf_frame(s)))]
     longest_s = max((r.spans_s for r in found), default=0.0)
@@ -367,7 +265,7 @@ def _octave(gnss: GnssReport, wanders_m: float | None, level_m: float, *, claime
     return round(math.log2(max(taken_m, *(gnss.scatter_m or ())[:2], drift_m, 1e-3)))
 
 
-def _beside_others(gnss: GnssReport, rivals: Sequence[GnssReport], bag: _Contents) -> GnssReport:
+def _beside_others(gnss: GnssReport, rivals: Sequence[GnssReport], bag: Contents) -> GnssReport:
     """Return the report with by how much it and the other receiver that it agrees with best wander against each other, and how far off others sit."""
     beside = {
         other.topic: found
@@ -382,7 +280,7 @@ def _beside_others(gnss: GnssReport, rivals: Sequence[GnssReport], bag: _Content
 
 
 def _odometry_reports(
-    bag: _Contents, gnss: Sequence[GnssReport], reference: _Track
+    bag: Contents, gnss: Sequence[GnssReport], reference: _Track
 ) -> list[tuple[TopicData, OdometryReport]]:
     frame = gnss[0].tf_frame if gnss else None
     mount = bag.tree.resolve(bag.tree.body(), frame) if frame else None
@@ -395,7 +293,7 @@ def _odometry_reports(
 
 
 def _compass_reports(
-    bag: _Contents, imus: Sequence[ImuReport], turning: Turning | None, courses: Courses | None, together: _Late = _NONE
+    bag: Contents, imus: Sequence[ImuReport], turning: Turning | None, courses: Courses | None, together: _Late = _NONE
 ) -> tuple[CompassReport, ...]:
     """Report every orientation that may be a heading, by how the best IMU turned; see `_without_echoes` for their order.
 
@@ -443,48 +341,6 @@ def _timed_velocity(report: VelocityReport, late: MotionOffset | None, together:
     return replace(report, late_s=fixes_late_s, late_with_fixes=True)
 
 
-def _without_leaps(streams: Sequence[TopicData]) -> tuple[list[TopicData], tuple[str, ...]]:
-    """Return the streams with stamps put right as they are when the bag is read (`without_leaps`), and a line for each such topic."""
-    imu = next((s for s in streams if s.msgtype == IMU and len(s)), None)
-    if imu is None or leaps(imu.stamps_ns, imu.logs_ns):
-        return list(streams), ()
-    latency_s = usual_latency_s(imu.stamps_ns, imu.logs_ns)
-    right, lines = [], dict[str, str]()
-    for stream in streams:
-        topic = stream.topic.partition(" ")[0]
-        if not stream.recorded:
-            stamps_ns, said = without_leaps(stream.stamps_ns, stream.logs_ns, latency_s, topic)
-            if said:
-                stream = stream.stamped(stamps_ns)
-                lines.setdefault(topic, said)
-        right.append(stream)
-    return right, tuple(lines.values())
-
-
-def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
-    """Return which clocks were set during the run, by topic, unless all were alike: then they are one clock, and what it leaves is a gap."""
-    stamped = [s for s in streams if len(s) >= FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED]
-    steps: dict[str, ClockStep | None] = {}
-    for stream in stamped:  # of what comes on one topic, some may come on one side only
-        topic = stream.topic.partition(" ")[0]
-        steps[topic] = steps.get(topic) or step(stream.stamps_ns, stream.logs_ns)
-    found = {topic: at for topic, at in steps.items() if at is not None}
-    sizes = [at.by_s for at in found.values()]
-    if not found or (len(found) == len(steps) and max(sizes) - min(sizes) < GAIN_LIMIT_S):
-        return {}
-    return found
-
-
-def _as_mostly_set(stream: TopicData, steps: Mapping[str, ClockStep]) -> TopicData:
-    """Return the stream with the stamps of before, or after, its clock was set moved to where most are: else it contradicts itself."""
-    at = steps.get(stream.topic.partition(" ")[0])
-    if at is None or stream.recorded:
-        return stream
-    after = stream.logs_ns >= at.at_ns
-    by_ns = round(at.by_s * NS_PER_S)
-    return stream.stamped(stream.stamps_ns + np.where(after, 0, by_ns) - (0 if 2 * after.sum() > len(after) else by_ns))
-
-
 def _best_first(imus: Sequence[ImuReport]) -> list[ImuReport]:
     """Return whole IMUs with gravity in them first, the least noisy ones first; of those about as noisy, one whose mount tf or the motion tells."""
 
@@ -501,7 +357,7 @@ def _best_first(imus: Sequence[ImuReport]) -> list[ImuReport]:
 
 
 def _lacking(
-    bag: _Contents, imus: Sequence[ImuReport], gnss: Sequence[GnssReport], odometry: Sequence[OdometryReport]
+    bag: Contents, imus: Sequence[ImuReport], gnss: Sequence[GnssReport], odometry: Sequence[OdometryReport]
 ) -> list[str]:
     """Say which required sensors are missing, and then also which topics have an unsupported type: they may be it."""
     lines = []
@@ -593,7 +449,7 @@ def _timed_fixes(
 
 
 def _beside_motion(
-    gnss: GnssReport, bag: _Contents, wheels: Sequence[TopicData], velocities: Sequence[MeasuredMotion]
+    gnss: GnssReport, bag: Contents, wheels: Sequence[TopicData], velocities: Sequence[MeasuredMotion]
 ) -> GnssReport:
     """Return the report with how fast the fixes' error changes, by the first wheels, or velocity, that is no filter's output.
 
@@ -623,7 +479,7 @@ def _clearly(offset: MotionOffset | None) -> tuple[float, float] | None:
     return (offset.value_s, offset.sigma_s) if offset is not None and offset.clear else None
 
 
-def _looks_down(bag: _Contents, imus: Sequence[ImuReport], gnss: Sequence[GnssReport]) -> bool:
+def _looks_down(bag: Contents, imus: Sequence[ImuReport], gnss: Sequence[GnssReport]) -> bool:
     """Return whether the body of tf has its axes ahead, to starboard, down, as makers of INSs have: x and z of the IMU and the antennas say so.
 
     A driver with such axes of its own, under the frame of a URDF, has its antennas above.
@@ -652,115 +508,7 @@ def _in_turned_body(imu: ImuReport) -> ImuReport:
     return imu if xyz_m is None else replace(imu, mount=replace(imu.mount, xyz_m=vec(_DOWN @ np.array(xyz_m) + 0.0)))
 
 
-def _mounted(bag: _Contents, firsts: Mapping[str, _First]) -> tuple[MountedTopic, ...]:
-    body = bag.tree.body()
-    return tuple(
-        MountedTopic(
-            topic=topic,
-            frame_id=first.frame,
-            tf_frame=first.frame if bag.tree.resolve(body, first.frame) else None,
-            latency_s=first.latency_s,
-        )
-        for topic, first in sorted(firsts.items())
-    )
-
-
-def _cameras(bag: _Contents) -> tuple[MountedTopic, ...]:
-    """Return the topics of images and of tag lists; of those that show the same camera's images one is to be read.
-
-    Of a camera, images come first, whose noise the detector measures, before those that were resampled, and lists.
-    """
-    cameras = [_camera(bag, camera) for camera in _mounted(bag, bag.cameras)]
-    first: dict[tuple[str, str], str] = {}
-    for camera in sorted(cameras, key=lambda c: (c.listed, is_rectified(c.topic))):
-        if camera.frame_id and camera.info_topic:
-            first.setdefault((camera.frame_id, camera.info_topic), camera.topic)
-    used = [first.get((c.frame_id, c.info_topic), c.topic) for c in cameras]
-    return tuple(
-        c if topic == c.topic else replace(c, left_out=f"the same camera as {topic}, whose tags would count twice")
-        for c, topic in zip(cameras, used, strict=True)
-    )
-
-
-def _lidars(bag: _Contents) -> tuple[MountedTopic, ...]:
-    """Return the topics of clouds; of those in one LiDAR's frame one is to be read, and none that a program placed in the world."""
-    lidars, body = _mounted(bag, bag.lidars), bag.tree.body()
-    first: dict[str, str] = {}
-    for lidar in sorted(lidars, key=lambda m: (bool(_DERIVED.search(m.topic)), len(m.topic))):
-        if lidar.frame_id not in ("", body):  # clouds of several LiDARs may have been moved there
-            first.setdefault(lidar.frame_id, lidar.topic)
-
-    def why_not(lidar: MountedTopic) -> str:
-        if lidar.frame_id in WORLD_NAMES:
-            return f"in the frame '{lidar.frame_id}', where a program placed it: no LiDAR's own axes"
-        if _NO_LIDAR.search(lidar.topic):
-            return "by its name of no LiDAR; its range and noise are others"
-        other = first.get(lidar.frame_id, lidar.topic)
-        return (
-            ""
-            if other == lidar.topic
-            else f"in the same frame as {other}: its points would count twice, or it needs a mount of its own"
-        )
-
-    return tuple(replace(lidar, left_out=why_not(lidar)) for lidar in lidars)
-
-
-def _camera(bag: _Contents, camera: MountedTopic) -> MountedTopic:
-    """Add the topic of the CameraInfo, if one can be told, and whether the topic lists tags instead of images.
-
-    It lies beside images. That of a list of tags is the one with its frame, as detectors copy headers; or, of a single
-    camera, the only one.
-    """
-    camera = replace(camera, optical=_optical(bag, camera))
-    listed = bool(set(LISTS) & set(bag.topics[camera.topic].msgtypes))
-    beside = camera_info_topic(camera.topic)
-    if beside in bag.topics and INFO in bag.topics[beside].msgtypes:
-        return replace(camera, info_topic=beside, listed=listed)
-    alike = [topic for topic, info in bag.infos.items() if info.frame == camera.frame_id]
-    found = alike or (list(bag.infos) if len(bag.cameras) == 1 else [])
-    if len(found) != 1:
-        return replace(camera, listed=listed)
-    why = "the one of its frame" if alike else "the only one"
-    return replace(camera, info_topic=found[0], info_why=why, listed=listed)
-
-
-def _optical(bag: _Contents, camera: MountedTopic) -> tuple[Vec, Vec] | None:
-    """Return the mount of a camera's optical frame where tf's frame of it has x ahead and z up: drivers name `camera_link`."""
-    pose = bag.tree.resolve(bag.tree.body(), camera.tf_frame) if camera.tf_frame else None
-    if pose is None or pose[1][2, 2] < _SKY:
-        return None
-    turned = rpy_from_rotation(pose[1] @ rotation_from_rpy_deg(_LOOKS_AHEAD_DEG))
-    return vec(pose[0]), vec(np.degrees(turned))
-
-
-def _pictures(bag: Bag) -> list[str]:
-    """Return the topics of images and tag lists; of a camera that has both kinds of images, the compressed one; no depth images."""
-    kinds = (*IMAGES, *LISTS)
-    every = [t.topic for t in bag.topics.values() if set(kinds) & set(t.msgtypes) and t.messages]
-    return [t for t in every if f"{t}/compressed" not in every and "depth" not in t.lower()]
-
-
-def _firsts_of(bag: Bag, topics: Sequence[str]) -> dict[str, _First]:
-    """Return what the header says of the first readable message of each topic, if that is among the first 200.
-
-    Each topic is read separately: a topic without any readable message would otherwise cause all others to be unpacked
-    to the end of the bag.
-    """
-    found: dict[str, _First] = {}
-    for topic in topics:
-        for raw in islice(bag.messages({topic}), _MOST_TRIED):
-            try:
-                msg: Any = bag.decode(raw)
-                stamp_ns = header_stamp_ns(msg)
-                latency_s = None if stamp_ns is None else seconds_between(stamp_ns, raw.log_ns)
-                found[topic] = _First(str(msg.header.frame_id).lstrip("/"), latency_s)
-                break
-            except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; a later one will do
-                continue
-    return found
-
-
-def _best_track(bag: _Contents, gnss: Sequence[GnssReport]) -> _Track:
+def _best_track(bag: Contents, gnss: Sequence[GnssReport]) -> _Track:
     """Return the track of the first receiver, without frozen fixes; without one, that of poses in a map grid; else an empty one."""
     if not gnss:
         return _grid_track(bag)
@@ -770,7 +518,7 @@ def _best_track(bag: _Contents, gnss: Sequence[GnssReport]) -> _Track:
     return _Track(stamps_ns[good], p_m[good], max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first)
 
 
-def _grid_track(bag: _Contents) -> _Track:
+def _grid_track(bag: Contents) -> _Track:
     """Return the first track in a map grid, about its first position; the grid's north is off by a few degrees."""
     for stream in bag.of_type(ODOMETRY, POSE, PLAIN_POSE):
         keep = sane(stream)

@@ -28,12 +28,13 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
 from graphloc.frontends import nmea
 from graphloc.frontends._assess_velocity import motions_of, velocity_report
+from graphloc.frontends._contents import contents_of
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._types import OTHER_TYPES
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import DECODERS, TWIST
-from graphloc.frontends.inspect import _read, draft_config, inspect_bag, render
+from graphloc.frontends.inspect import draft_config, inspect_bag, render
 from graphloc.ledger import Outcome
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, PoseFix
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
@@ -475,7 +476,7 @@ def test_a_clock_of_a_line_is_set_though_one_sentence_comes_later_and_one_has_no
         bodies |= {f"HEHDT,{0.01 * k:.3f},T": stamp} if k > 450 else {}
         for body, at in bodies.items():
             items.append(("/nmea", logged, make.t[SENTENCE](header=make.header(at, "gps"), sentence=sealed(body))))
-    bag = _read(write_bag(tmp_path / "run", make, sorted(items, key=lambda item: item[1])))
+    bag = contents_of(write_bag(tmp_path / "run", make, sorted(items, key=lambda item: item[1])))
     assert any("/nmea was set back by 18.00 s" in said for said in bag.warnings)
     places = bag.aligned["/nmea GPGGA"]
     np.testing.assert_array_equal(places.stamps_ns, places.logs_ns)

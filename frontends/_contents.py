@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `inspect` reads of a bag, before anything is judged."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from graphloc.frontends._assess import evenly, on_one_clock, without_drift
+from graphloc.frontends._clock import (
+    FEWEST_STAMPS,
+    GAIN_LIMIT_S,
+    ClockStep,
+    leaps,
+    recorder_set,
+    refuse_woven,
+    steady_logs,
+    step,
+    usual_latency_s,
+    without_leaps,
+)
+from graphloc.frontends._streams import Sentences, TopicData, read_streams
+from graphloc.frontends._tf import Pose, StaticTree
+from graphloc.frontends.aerial.cloud import CLOUDS
+from graphloc.frontends.decode import IMU, UNSTAMPED, header_stamp_ns
+from graphloc.frontends.source import Bag, TopicSummary
+from graphloc.frontends.tags.listed import LISTS
+from graphloc.frontends.tags.sightings import IMAGES, INFO
+from graphloc.signals.pauses import common_pauses, pauses_warning
+from graphloc.time import NS_PER_S, seconds_between
+
+_MOST_TRIED = 200  # messages of a topic that cannot be decoded
+
+
+class FirstMessage(NamedTuple):
+    """First readable message of a topic: its frame, and recording time minus stamp, s; None: it has no stamp."""
+
+    frame: str
+    latency_s: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contents:
+    """What is read of a bag.
+
+    Attributes:
+        source: its name, for messages. topics: by name, from its index.
+        streams: by topic, as recorded. aligned: those with messages, on one clock.
+        tree: of tf. sentences: what NMEA tells beside the streams. lidars, cameras, infos (their CameraInfos): by topic.
+    """
+
+    source: str
+    topics: Mapping[str, TopicSummary]
+    streams: Mapping[str, TopicData]
+    aligned: Mapping[str, TopicData]
+    tree: StaticTree
+    sentences: Sentences
+    lidars: Mapping[str, FirstMessage]
+    cameras: Mapping[str, FirstMessage]
+    infos: Mapping[str, FirstMessage]
+    warnings: tuple[str, ...]
+
+    def of_type(self, *msgtypes: str) -> list[TopicData]:
+        """Return the aligned streams of some message types."""
+        return [stream for stream in self.aligned.values() if stream.msgtype in msgtypes]
+
+    def tf_pose(self, stream: TopicData) -> Pose | None:
+        """Return T_body_sensor of a stream where tf connects its frame with the body."""
+        return self.tree.resolve(self.tree.body(), stream.frame_id) if stream.frame_id in self.tree.frames else None
+
+    def tf_frame(self, stream: TopicData) -> str | None:
+        """Return the frame of a stream where tf connects it with the body."""
+        return None if self.tf_pose(stream) is None else stream.frame_id
+
+
+def contents_of(paths: Path | str | Sequence[Path | str]) -> Contents:
+    """Read a whole bag: its topics, streams, transforms, and the first messages of LiDARs and cameras.
+
+    Args:
+        paths: as for `read_recording`.
+
+    Raises:
+        InputError: the bag cannot be opened, or its parts overlap in time.
+    """
+    with Bag(paths) as bag:
+        topics = bag.topics
+        bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
+        streams, tree, sentences = read_streams(bag)
+        lidars = _firsts_of(bag, [t.topic for t in topics.values() if set(CLOUDS) & set(t.msgtypes) and t.messages])
+        cameras = _firsts_of(bag, _pictures(bag))
+        infos = _firsts_of(
+            bag, [t.topic for t in topics.values() if INFO in t.msgtypes and t.messages] if cameras else []
+        )
+        source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
+    recorder = next((at for s in streams if (at := recorder_set(s.stamps_ns, s.logs_ns))), None)
+    if recorder is not None:
+        warnings += (recorder.said_of_recorder,)
+        streams = [s.logged(steady_logs(s.stamps_ns, s.logs_ns)) for s in streams]
+    streams, said_of_leaps = _without_leaps(streams)
+    warnings += said_of_leaps
+    streams = [evenly(s) if s.msgtype == IMU and len(s) else s for s in without_drift(streams)]
+    for stream in streams:
+        if stream.msgtype == IMU:
+            refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)
+    steps = _clock_steps(streams)
+    warnings = (*warnings, *(at.said(topic) for topic, at in steps.items()))
+    imu = next((s for s in streams if s.msgtype == IMU and len(s)), None)
+    if imu is not None:
+        said = pauses_warning(common_pauses(np.sort(imu.stamps_ns), (s.stamps_ns for s in streams if s is not imu)))
+        warnings = (*warnings, *([said] if said else []))
+    return Contents(
+        source=source, topics=topics, streams={s.topic: s for s in streams},
+        aligned={s.topic: s for s in on_one_clock([_as_mostly_set(s, steps) for s in streams if len(s)])},
+        tree=tree, sentences=sentences, lidars=lidars, cameras=cameras, infos=infos, warnings=warnings,
+    )  # fmt: skip
+
+
+def _without_leaps(streams: Sequence[TopicData]) -> tuple[list[TopicData], tuple[str, ...]]:
+    """Return the streams with stamps put right as they are when the bag is read (`without_leaps`), and a line for each such topic."""
+    imu = next((s for s in streams if s.msgtype == IMU and len(s)), None)
+    if imu is None or leaps(imu.stamps_ns, imu.logs_ns):
+        return list(streams), ()
+    latency_s = usual_latency_s(imu.stamps_ns, imu.logs_ns)
+    right, lines = [], dict[str, str]()
+    for stream in streams:
+        topic = stream.topic.partition(" ")[0]
+        if not stream.recorded:
+            stamps_ns, said = without_leaps(stream.stamps_ns, stream.logs_ns, latency_s, topic)
+            if said:
+                stream = stream.stamped(stamps_ns)
+                lines.setdefault(topic, said)
+        right.append(stream)
+    return right, tuple(lines.values())
+
+
+def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
+    """Return which clocks were set during the run, by topic, unless all were alike: then they are one clock, and what it leaves is a gap."""
+    stamped = [s for s in streams if len(s) >= FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED]
+    steps: dict[str, ClockStep | None] = {}
+    for stream in stamped:  # of what comes on one topic, some may come on one side only
+        topic = stream.topic.partition(" ")[0]
+        steps[topic] = steps.get(topic) or step(stream.stamps_ns, stream.logs_ns)
+    found = {topic: at for topic, at in steps.items() if at is not None}
+    sizes = [at.by_s for at in found.values()]
+    if not found or (len(found) == len(steps) and max(sizes) - min(sizes) < GAIN_LIMIT_S):
+        return {}
+    return found
+
+
+def _as_mostly_set(stream: TopicData, steps: Mapping[str, ClockStep]) -> TopicData:
+    """Return the stream with the stamps of before, or after, its clock was set moved to where most are: else it contradicts itself."""
+    at = steps.get(stream.topic.partition(" ")[0])
+    if at is None or stream.recorded:
+        return stream
+    after = stream.logs_ns >= at.at_ns
+    by_ns = round(at.by_s * NS_PER_S)
+    return stream.stamped(stream.stamps_ns + np.where(after, 0, by_ns) - (0 if 2 * after.sum() > len(after) else by_ns))
+
+
+def _pictures(bag: Bag) -> list[str]:
+    """Return the topics of images and tag lists; of a camera that has both kinds of images, the compressed one; no depth images."""
+    kinds = (*IMAGES, *LISTS)
+    every = [t.topic for t in bag.topics.values() if set(kinds) & set(t.msgtypes) and t.messages]
+    return [t for t in every if f"{t}/compressed" not in every and "depth" not in t.lower()]
+
+
+def _firsts_of(bag: Bag, topics: Sequence[str]) -> dict[str, FirstMessage]:
+    """Return what the header says of the first readable message of each topic, if that is among the first 200.
+
+    Each topic is read separately: a topic without any readable message would otherwise cause all others to be unpacked
+    to the end of the bag.
+    """
+    found: dict[str, FirstMessage] = {}
+    for topic in topics:
+        for raw in islice(bag.messages({topic}), _MOST_TRIED):
+            try:
+                msg: Any = bag.decode(raw)
+                stamp_ns = header_stamp_ns(msg)
+                latency_s = None if stamp_ns is None else seconds_between(stamp_ns, raw.log_ns)
+                found[topic] = FirstMessage(str(msg.header.frame_id).lstrip("/"), latency_s)
+                break
+            except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; a later one will do
+                continue
+    return found
