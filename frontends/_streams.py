@@ -19,6 +19,7 @@ from graphloc.frontends import nmea
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import FILTER, WATER
 from graphloc.frontends._tf import StaticTree
+from graphloc.frontends._vendor_said import Part, Said, SaidAlong, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
 from graphloc.frontends.decode import (
     GPS_FIXES,
     IMU,
@@ -40,17 +41,7 @@ from graphloc.frontends.decode import (
     stamp_ns_of,
 )
 from graphloc.frontends.source import TF_MOVING, TF_STATIC, Bag, RawMessage
-from graphloc.frontends.vendors import (
-    GEOGRAPHIC,
-    VENDORS,
-    Part,
-    Said,
-    SaidAlong,
-    SaidHeading,
-    SaidInertial,
-    SaidPlace,
-    SaidVelocity,
-)
+from graphloc.frontends.vendors import GEOGRAPHIC, VENDORS
 from graphloc.ledger import Outcome
 from graphloc.time import NS_PER_S
 

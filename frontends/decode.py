@@ -32,16 +32,8 @@ from graphloc.frames import Array, Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.frontends import nmea
 from graphloc.frontends._fixes import RTK_SIGMA_M
 from graphloc.frontends._rejections import Rejection, ignored, malformed, rejected
-from graphloc.frontends.vendors import (
-    STAMPS,
-    VENDORS,
-    Part,
-    SaidAlong,
-    SaidHeading,
-    SaidInertial,
-    SaidPlace,
-    SaidVelocity,
-)
+from graphloc.frontends._vendor_said import Part, SaidAlong, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
+from graphloc.frontends.vendors import STAMPS, VENDORS
 from graphloc.measurements import (
     AXES,
     NO_HEIGHT_M2,
