@@ -38,9 +38,8 @@ from graphloc.signals.white_noise import white_noise
 from graphloc.time import NS_PER_S
 
 _LEFT_OF_TURNS = 0.5  # of the changes of a course, that the turning about the right axis leaves at most
-_UPSIDE_DOWN_DEG = (
-    150.0  # of gravity, by the mount in tf, from body z; no mount is off by 30 deg unnoticed, one by 180 is; a choice
-)
+# Of gravity, by the mount in tf, from body z; no mount is off by 30 deg unnoticed, one by 180 is; a choice.
+_UPSIDE_DOWN_DEG = 150.0
 # Quiet seconds in a row; for how long it is slow, at most, that only changes its direction.
 _QUIET_S, _STANDS_S = 2, 1.5
 # Off body z, from which gravity is said to be; about a quarter turn, by which it, or the motion, overrules tf, and how coherent.

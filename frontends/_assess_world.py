@@ -18,9 +18,8 @@ from graphloc.time import NS_PER_S
 
 _EXTENT_M = 20.0  # a shorter way does not tell directions
 _SLACK_M = 3.0  # sideways, of an antenna that may be anywhere on the craft
-_FAR_M = (
-    50e3  # from the origin no run goes so far, and coordinates of a map grid (hundreds of km) are farther; a choice
-)
+# From the origin no run goes so far, and coordinates of a map grid (hundreds of km) are farther; a choice.
+_FAR_M = 50e3
 _STANDS = 0.1  # of the fixes' extent: what moves less is not the craft
 _APART_M, _APART = 5.0, 0.02  # largest distance that still fits: metres, share of the extent
 

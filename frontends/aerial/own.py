@@ -22,9 +22,8 @@ _AWAY_M = 25.0  # half a large vessel
 _FEWEST_SCANS = 10
 _MOVED_M = 20.0  # until then what stands still may seem to stay
 _STAYS = 0.8  # of the scans; of a launch 39 of 70 cells, others at most 0.7
-_CLOSE_M = (
-    3.0  # to a LiDAR, or a corner of the hull: she begins there; a quay that she goes along stays as well, farther off
-)
+# To a LiDAR, or a corner of the hull: she begins there; a quay that she goes along stays as well, farther off.
+_CLOSE_M = 3.0
 _GAP_M = 1.5
 _WALL = "a wall that she went along all the time"  # of a lock or canal, nearer than what is told from her
 _FEWEST_CELLS = 8

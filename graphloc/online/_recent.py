@@ -10,9 +10,8 @@ from graphloc.measurements import ImuSample, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._lag import Lag
 
-_EVERY_S = (
-    1.0  # between two anchors: a rebuild begins up to that much before the window; as long as a page of it (`_live`)
-)
+# Between two anchors: a rebuild begins up to that much before the window; as long as a page of it (`_live`).
+_EVERY_S = 1.0
 
 
 class Recent:

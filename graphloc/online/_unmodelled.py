@@ -39,9 +39,8 @@ from graphloc.time import NS_PER_S
 
 _ROTATION, _POSITION, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 _CORE = 15  # rotation, position, velocity, bias
-_MOUNT_EVERY_S = (
-    0.5  # to save time, where nothing but the mount is left out: what that does changes over seconds; a choice
-)
+# To save time, where nothing but the mount is left out: what that does changes over seconds; a choice.
+_MOUNT_EVERY_S = 0.5
 
 
 class BeforeStart(NamedTuple):

@@ -15,9 +15,8 @@ from graphloc.solve.decide import Stage, Verdicts, decisions, log_evidence, met,
 from graphloc.solve.stretch import moved, unwound
 
 SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1
-_ROUGHLY_SETTLED_M = (
-    0.5  # of the thinned run: the passes over the whole one begin there and go on to `SETTLED_M`; a choice
-)
+# Of the thinned run: the passes over the whole one begin there and go on to `SETTLED_M`; a choice.
+_ROUGHLY_SETTLED_M = 0.5
 _UPHILL = 1.1  # times the cost before: above it a single step has failed
 _OUTLIER = 0.1  # weight under its own kernel below which a measurement is an outlier
 

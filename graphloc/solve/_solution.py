@@ -37,9 +37,8 @@ from graphloc.solve.unmodelled import unmodelled
 from graphloc.solve.warnings import mount_event, mount_warning, stats_of
 from graphloc.trajectory import Trajectory
 
-_NEAR_BERTH_M = (
-    60.0  # within which a track is told from a berth, whose tags are seen from 25 m; only what is written hangs on it
-)
+# Within which a track is told from a berth, whose tags are seen from 25 m; only what is written hangs on it.
+_NEAR_BERTH_M = 60.0
 _SHOWN_RAD = np.radians(15.0)  # 1 sigma, somewhere in the run, from which the motion tells the heading
 _TOLD_RAD = np.radians(7.0)  # 1 sigma of a heading of which those 30 deg beside it cost 8 more, as in `_start`
 
