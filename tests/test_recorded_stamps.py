@@ -237,6 +237,16 @@ def test_messages_of_a_slow_sensor_in_bursts_are_of_no_clock_that_was_set(period
         assert leaps(stamps_ns, (stamps_ns // burst_ns + 1) * burst_ns) == []
 
 
+def test_of_two_receivers_on_one_topic_none_is_set_where_one_falls_silent() -> None:
+    """The stamps of the right one were moved by what the other, of GPS time, is ahead."""
+    own_ns = START_NS + np.arange(0, 300 * S, S)
+    others_ns = own_ns[:150] + S // 2
+    logs_ns = np.concatenate([own_ns, others_ns])
+    order = np.argsort(logs_ns)
+    stamps_ns = np.concatenate([own_ns, others_ns + 18 * S])
+    assert leaps(stamps_ns[order], logs_ns[order]) == []
+
+
 def test_clocks_that_are_set_together_are_one(tmp_path: Path) -> None:
     ahead = lambda ns: ns + 3 * S * (ns > START_NS + 25 * S)
     seen, config, _ = look(tmp_path, restamped(dict.fromkeys(WAY_NS, ahead)), MAKE)
