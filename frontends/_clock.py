@@ -171,7 +171,7 @@ def leaps(stamps_ns: Stamps, logs_ns: Stamps) -> list[tuple[int, ClockStep]]:
             continue
         usual_ns = [np.quantile(side_ns, _SOONER) for side_ns in (before_ns, after_ns)]
         steady = all(
-            np.mean(np.abs(side_ns - level_ns) < _WHOLE_S * NS_PER_S) >= _ALIKE
+            np.mean(np.abs(side_ns - level_ns) < 2 * _WHOLE_S * NS_PER_S) >= _ALIKE
             for side_ns, level_ns in zip((before_ns, after_ns), usual_ns, strict=True)
         )
         by_s = float(usual_ns[1] - usual_ns[0]) / NS_PER_S
