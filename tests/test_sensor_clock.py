@@ -101,6 +101,13 @@ def test_stamps_that_become_right_are_used_as_they_come(by_s: float) -> None:
     assert [f"set by {-by_s:+.0f} s" in e for e in events if "used as they come" in e] == [True]
 
 
+def test_a_leap_second_of_messages_that_take_most_of_one_is_put_right() -> None:
+    """Before, they were 0.6 s behind the IMU's, after it 0.4 s ahead, which is nearer, but of the future."""
+    taken, events = taken_of(lambda t_s: -0.58 + (1.0 if t_s >= 30.0 else 0.0), 60.0)
+    assert [m.stamp_ns for m in taken] == [round((m.seq / HZ - 0.58) * 1e9) for m in taken]
+    assert ["put right" in e for e in events] == [True]
+
+
 @pytest.mark.parametrize("by_s", [18.0, -18.0])
 def test_a_clock_that_is_set_again_while_the_receiver_is_silent(by_s: float) -> None:
     """It was switched off and on; what was known of its clock is of before."""

@@ -90,7 +90,7 @@ class SensorClock:
     def _as_they_come(self, m: Measurement) -> tuple[list[Measurement], str] | None:
         """Put stamps right no more where they are nearer to the IMU's as they come: the clock was set again while the sensor was silent."""
         usual_ns = median(self._ahead_ns)
-        if len(self._ahead_ns) < _FEWEST or abs(usual_ns + self.set_ns) >= abs(usual_ns):
+        if len(self._ahead_ns) < _FEWEST or _wrong(usual_ns + self.set_ns) >= _wrong(usual_ns):
             return None
         m, self.set_ns = replace(m, stamp_ns=m.stamp_ns + self.set_ns), 0
         said = f"{m.sensor}: its clock was set again, unseen: its stamps are used as they come from {utc_text(m.stamp_ns)} on"
@@ -115,7 +115,7 @@ class SensorClock:
         whole_s = round(by_s)
         if not whole_s or abs(by_s - whole_s) > _WHOLE_S:
             return self._begin_anew(), ""
-        if abs(usual_s + by_s) < abs(usual_s):
+        if _wrong(usual_s + by_s) < _wrong(usual_s):
             found = self._begin_anew()
             return found, (
                 f"{found[0].sensor}: its stamps were {abs(usual_s):.1f} s {'ahead of' if usual_s > 0 else 'behind'} the IMU's "
@@ -127,3 +127,8 @@ class SensorClock:
         if abs(whole_s) == _GPS_AHEAD_S:
             said += f", as from {'UTC to GPS time' if whole_s > 0 else 'GPS time to UTC'}"
         return found, f"{said}: its stamps are put right by that from there on"
+
+
+def _wrong(ahead: float) -> float:
+    """Return how far stamps are off the IMU's; twice as far where they are ahead of it: a message may come late, but hardly early."""
+    return max(-ahead, 2.0 * ahead)
