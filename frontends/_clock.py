@@ -42,6 +42,7 @@ FEWEST_STAMPS = 100
 _WHOLE_S = 0.1  # by which a leap of whole seconds may seem off, as messages take longer or shorter
 _BESIDE, _FEWEST_BESIDE = 20, 10  # messages to either side that tell a leap
 _SOONER = 0.75  # of these: others were delayed
+_ALIKE = 0.7  # of these, that came as soon: not so of two clocks on one topic, nor where hardly two take equally long
 _TENTHS = 10  # of a run
 _EVEN = 0.15  # of the gain, that a clock may be off an even one
 _MOST_DRIFT = 0.1  # of time: beyond, it is none, and the configuration takes none
@@ -168,9 +169,14 @@ def leaps(stamps_ns: Stamps, logs_ns: Stamps) -> list[tuple[int, ClockStep]]:
         before_ns, after_ns = ahead_ns[max(i - _BESIDE, found[-1][0] if found else 0) : i], ahead_ns[i : i + _BESIDE]
         if min(len(before_ns), len(after_ns)) < _FEWEST_BESIDE:
             continue
-        by_s = float(np.quantile(after_ns, _SOONER) - np.quantile(before_ns, _SOONER)) / NS_PER_S
+        usual_ns = [np.quantile(side_ns, _SOONER) for side_ns in (before_ns, after_ns)]
+        steady = all(
+            np.mean(np.abs(side_ns - level_ns) < 2 * _WHOLE_S * NS_PER_S) >= _ALIKE
+            for side_ns, level_ns in zip((before_ns, after_ns), usual_ns, strict=True)
+        )
+        by_s = float(usual_ns[1] - usual_ns[0]) / NS_PER_S
         whole_s = round(by_s)
-        here = abs(by_ns[i - 1] / NS_PER_S - whole_s) < LEAP_S
+        here = steady and abs(by_ns[i - 1] / NS_PER_S - whole_s) < LEAP_S
         if whole_s and here and abs(by_s - whole_s) < _WHOLE_S:
             found.append((i, ClockStep(float(whole_s), int(logs_ns[i]))))
     return found

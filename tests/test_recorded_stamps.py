@@ -228,6 +228,25 @@ def test_messages_that_are_late_by_a_whole_second_are_of_no_clock_that_was_set()
     assert leaps(stamps_ns + 18 * S * (np.arange(300) == 100), stamps_ns) == []
 
 
+@pytest.mark.parametrize("period_s", [0.5, 1.0, 2.0])
+def test_messages_of_a_slow_sensor_in_bursts_are_of_no_clock_that_was_set(period_s: float) -> None:
+    """Within a burst they come at once, and their stamps, seconds apart, seem to leap."""
+    stamps_ns = START_NS + np.round(np.arange(0, 300) * period_s * S).astype(np.int64)
+    for each in range(2, 40):
+        burst_ns = round(each * period_s * S)
+        assert leaps(stamps_ns, (stamps_ns // burst_ns + 1) * burst_ns) == []
+
+
+def test_of_two_receivers_on_one_topic_none_is_set_where_one_falls_silent() -> None:
+    """The stamps of the right one were moved by what the other, of GPS time, is ahead."""
+    own_ns = START_NS + np.arange(0, 300 * S, S)
+    others_ns = own_ns[:150] + S // 2
+    logs_ns = np.concatenate([own_ns, others_ns])
+    order = np.argsort(logs_ns)
+    stamps_ns = np.concatenate([own_ns, others_ns + 18 * S])
+    assert leaps(stamps_ns[order], logs_ns[order]) == []
+
+
 def test_clocks_that_are_set_together_are_one(tmp_path: Path) -> None:
     ahead = lambda ns: ns + 3 * S * (ns > START_NS + 25 * S)
     seen, config, _ = look(tmp_path, restamped(dict.fromkeys(WAY_NS, ahead)), MAKE)

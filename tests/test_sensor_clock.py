@@ -79,6 +79,46 @@ def test_stamps_that_are_ahead_from_the_start_are_told() -> None:
     assert sum("gnss: its stamps are 18.0 s ahead of the IMU's" in e for e in fed.events) == 1
 
 
+def taken_of(off_s: Callable[[float], float | None], until_s: float) -> tuple[list[Measurement], list[str]]:
+    """What a clock that is `off_s` makes of fixes at 4 Hz, numbered by fourths of a second; None: the receiver is silent."""
+    clock, taken, events = SensorClock(), list[Measurement](), list[str]()
+    fix = next(a.m for a in arrivals_of(run_of()) if isinstance(a.m, GnssPosition))
+    for n in range(round(until_s * HZ)):
+        if (by_s := off_s(n / HZ)) is not None:
+            m = replace(fix, stamp_ns=round((n / HZ + by_s) * 1e9), seq=n)
+            found, said = clock.take(m, round((n / HZ + 0.02) * 1e9))
+            taken += found
+            events += [said] if said else []
+    return taken, events
+
+
+@pytest.mark.parametrize("by_s", [18.0, -18.0, 3.0])
+def test_stamps_that_become_right_are_used_as_they_come(by_s: float) -> None:
+    """As of a receiver that learns of leap seconds some minutes after it was switched on."""
+    taken, events = taken_of(lambda t_s: by_s if t_s < 30.0 else 0.0, 60.0)
+    assert [m.seq for m in taken] == list(range(240))
+    assert all(m.stamp_ns == round(m.seq / HZ * 1e9) for m in taken[120:])
+    assert [f"set by {-by_s:+.0f} s" in e for e in events if "used as they come" in e] == [True]
+
+
+def test_a_leap_second_of_messages_that_take_most_of_one_is_put_right() -> None:
+    """Before, they were 0.6 s behind the IMU's, after it 0.4 s ahead, which is nearer, but of the future."""
+    taken, events = taken_of(lambda t_s: -0.58 + (1.0 if t_s >= 30.0 else 0.0), 60.0)
+    assert [m.stamp_ns for m in taken] == [round((m.seq / HZ - 0.58) * 1e9) for m in taken]
+    assert ["put right" in e for e in events] == [True]
+
+
+@pytest.mark.parametrize("by_s", [18.0, -18.0])
+def test_a_clock_that_is_set_again_while_the_receiver_is_silent(by_s: float) -> None:
+    """It was switched off and on; what was known of its clock is of before."""
+    taken, events = taken_of(lambda t_s: None if 30.0 <= t_s < 40.0 else by_s if 20.0 <= t_s < 30.0 else 0.0, 60.0)
+    assert [m.seq for m in taken] == [*range(120), *range(160, 240)]
+    right = [m.stamp_ns == round(m.seq / HZ * 1e9) for m in taken]
+    assert all(right[:120])
+    assert all(right[130:])  # by ten it is told
+    assert "set again" in events[1]
+
+
 # What is none
 
 
@@ -155,7 +195,18 @@ def _with_stalls(t_s: Array, rng: np.random.Generator) -> Array:
     return late_s
 
 
-@pytest.mark.parametrize("late_s", [_random, _in_bursts, _by_whole_seconds, _with_stalls])
+def _through_a_full_queue(t_s: Array, rng: np.random.Generator) -> Array:
+    """Ten times each message waits longer than the one before, up to some seconds, and then they wait less and less."""
+    late_s = np.zeros(len(t_s))
+    for begin_s in np.arange(15.0, 300.0, 30.0):
+        within = (t_s >= begin_s) & (t_s < begin_s + 30.0)
+        fills_s, most_s = rng.uniform(0.3, 6.0), rng.uniform(0.5, 4.0)
+        filled = 1.0 - np.exp(-(t_s[within] - begin_s) / fills_s)
+        late_s[within] = np.minimum(most_s * filled, np.clip(begin_s + 30.0 - t_s[within], 0.0, None) * 0.5)
+    return late_s + rng.uniform(0.0, 0.03, len(t_s))
+
+
+@pytest.mark.parametrize("late_s", [_random, _in_bursts, _by_whole_seconds, _with_stalls, _through_a_full_queue])
 @pytest.mark.parametrize("hz", [1.0, 4.0, 10.0])
 def test_messages_that_come_late_are_no_leap(late_s: Callable[[Array, np.random.Generator], Array], hz: float) -> None:
     """Also where they come in bursts, or overtake each other."""
