@@ -367,7 +367,11 @@ def _lacking(
         around = " (scans are matched around a track, which they cannot begin)" if bag.lidars else ""
         said = "nothing in it tells the place: no GNSS fix that can be used, no pose, no camera for tags"
         lines.append(f"{said}; smooth, replay and compare need one: record it, too{around}")
-    read = {name.partition(" ")[0] for name in bag.streams}  # of NMEA a stream is a sentence
+    read = {
+        *(name.partition(" ")[0] for name in bag.streams),
+        *bag.lidars,
+        *bag.cameras,
+    }  # of NMEA a stream is a sentence
     others = [
         t
         for t in bag.topics.values()
