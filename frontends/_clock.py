@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from graphloc.config import AerialConfig, SensorConfig
 from graphloc.errors import InputError
-from graphloc.time import NS_PER_S, duration_ns, utc_text
+from graphloc.time import GPS_AHEAD_S, NS_PER_S, duration_ns, utc_text
 
 Stamps = NDArray[np.int64]
 JUMP_LIMIT_S = 60.0
@@ -29,8 +29,6 @@ NO_DATE_NS = 946_684_800 * NS_PER_S
 """2000-01-01: a stamp before it is no date."""
 SCANS_AHEAD_S = 0.15
 """Scans are stamped later than an IMU's samples that come at once by no more: these may take as long on their way."""
-GPS_AHEAD_S = 18.0
-"""GPS time is ahead of UTC by, since 2017."""
 LEAP_S = 0.5
 """By how much a clock may be off that and still be taken for it."""
 GAIN_LIMIT_S = 0.1

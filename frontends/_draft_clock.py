@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 
 from graphloc.frontends._clock import (
     EPOCH_LIMIT_S,
-    GPS_AHEAD_S,
     LEAP_S,
     MOST_ON_ITS_WAY_S,
     SCANS_AHEAD_S,
@@ -26,6 +25,7 @@ from graphloc.frontends._reports import (
     VelocityReport,
 )
 from graphloc.frontends.decode import UNSTAMPED
+from graphloc.time import GPS_AHEAD_S
 
 # Of a velocity that is averaged over seconds: its error lasts as long, and would count as white.
 _FILTERED_SIGMA_MPS = 1.0

@@ -84,14 +84,17 @@ def test_a_drifting_receiver_is_in_the_bounds_of_heading_and_velocity() -> None:
     assert 0.6 < velocity < 1.2
 
 
+def with_drift_as_state(config: VesselConfig) -> VesselConfig:
+    gnss = config.sensors["gnss"]
+    slow_error = gnss.slow_error.model_copy(update={"enabled": True, "jumps": False})
+    return config.with_sensors({"gnss": gnss.model_copy(update={"slow_error": slow_error})})
+
+
 def test_a_drift_does_not_turn_the_heading_against_the_compass(monkeypatch: pytest.MonkeyPatch) -> None:
     """As good as with the drift as a state, which the antenna's place does not have: it follows the fixes."""
     run, recording, config = drifting(1, 2.0, compass_hz=5.0)
     config = with_few_states(config, 2.0)
-    gnss = config.sensors["gnss"]
-    slow_error = gnss.slow_error.model_copy(update={"enabled": True, "jumps": False})
-    full = config.with_sensors({"gnss": gnss.model_copy(update={"slow_error": slow_error})})
-    lever_m = gnss.mount.t_body_sensor_m
+    full, lever_m = with_drift_as_state(config), config.sensors["gnss"].mount.t_body_sensor_m
 
     def solved(config: VesselConfig) -> Trajectory:
         return app.smooth_recording(recording, config).solution.trajectory
@@ -118,10 +121,7 @@ def test_in_an_outage_at_the_end_the_antenna_moves_as_with_the_drift_as_a_state(
     kept = [m for m in recording.measurements if not isinstance(m, GnssPosition) or begin_ns <= m.stamp_ns <= end_ns]
     recording = replace(recording, measurements=tuple(kept))
     config = with_few_states(config, 2.0)
-    gnss = config.sensors["gnss"]
-    slow_error = gnss.slow_error.model_copy(update={"enabled": True, "jumps": False})
-    full = config.with_sensors({"gnss": gnss.model_copy(update={"slow_error": slow_error})})
-    lever_m = gnss.mount.t_body_sensor_m
+    full, lever_m = with_drift_as_state(config), config.sensors["gnss"].mount.t_body_sensor_m
 
     def moved_m(config: VesselConfig) -> Array:
         """How far the antenna is from where the fixes begin, and end, before and after."""

@@ -11,7 +11,7 @@ from dataclasses import replace
 from statistics import median
 
 from graphloc.measurements import Measurement
-from graphloc.time import NS_PER_S, utc_text
+from graphloc.time import GPS_AHEAD_S, NS_PER_S, utc_text
 
 _REMEMBERED, _FEWEST = 20, 10  # measurements that tell how their stamps and arrival usually are
 _IN_A_ROW = 5  # measurements after a leap that tell it: an outlying stamp is one
@@ -20,7 +20,6 @@ _SLOWEST_S = 1.2  # between arrivals: of slower sensors the first ones held back
 _UNEVEN = 0.5  # of the usual time between arrivals: a message that waited, or an IMU that stalled, is no leap
 _STEADY = 0.75  # of those before, that came alike
 _AT_ONCE_S = 0.75  # between two messages, at the least: where they wait longer and longer each does by `_UNEVEN` of `_SLOWEST_S` at most
-_GPS_AHEAD_S = 18  # of UTC, since 2017
 _FUTURE_S = 3.0  # ahead of the IMU, all the time: no message is that much faster
 
 
@@ -62,12 +61,12 @@ class SensorClock:
         if len(self._ahead_ns) < _FEWEST:
             found = self._learn(m, ahead_ns, apart_ns)
             return self._as_they_come(m) or (found, self._from_the_future(m.sensor))
-        usual_ns, whole_ns = median(self._apart_ns), _WHOLE_S * NS_PER_S
-        even = 0 < usual_ns <= _SLOWEST_S * NS_PER_S and abs(apart_ns - usual_ns) <= max(_UNEVEN * usual_ns, whole_ns)
         before_ns = median(self._ahead_ns)
         by_ns = ahead_ns - round(before_ns)
         if abs(by_ns) < _SEEMS_S * NS_PER_S and not self._held:
             return self._learn(m, ahead_ns, apart_ns), ""
+        usual_ns, whole_ns = median(self._apart_ns), _WHOLE_S * NS_PER_S
+        even = 0 < usual_ns <= _SLOWEST_S * NS_PER_S and abs(apart_ns - usual_ns) <= max(_UNEVEN * usual_ns, whole_ns)
         near = sum(abs(each_ns - before_ns) <= whole_ns for each_ns in self._ahead_ns)
         steady = near >= _STEADY * len(self._ahead_ns)
         at_once = abs(ahead_ns - self._ahead_ns[-1]) >= _AT_ONCE_S * NS_PER_S
@@ -124,7 +123,7 @@ class SensorClock:
         self.set_ns += whole_s * NS_PER_S
         found = [replace(m, stamp_ns=m.stamp_ns - whole_s * NS_PER_S) for m in self.left()]
         said = f"{found[0].sensor}: its clock was set {'forward' if whole_s > 0 else 'back'} by {abs(whole_s)} s at {utc_text(found[0].stamp_ns)}"
-        if abs(whole_s) == _GPS_AHEAD_S:
+        if abs(whole_s) == GPS_AHEAD_S:
             said += f", as from {'UTC to GPS time' if whole_s > 0 else 'GPS time to UTC'}"
         return found, f"{said}: its stamps are put right by that from there on"
 
