@@ -84,6 +84,25 @@ def test_stamps_that_are_ahead_from_the_start_are_told() -> None:
     assert sum("gnss: its stamps are 18.0 s ahead of the IMU's" in e for e in fed.events) == 1
 
 
+@pytest.mark.parametrize("by_s", [18.0, 3.0, -3.0])
+def test_an_estimate_that_wrong_stamps_have_misled_starts_anew(by_s: float) -> None:
+    """Fixes that came before the clock became right are put right, too: those 18 s ahead would wait so long for the IMU."""
+    begin_ns = arrivals_of(run_of())[0].true_ns
+    arrivals = with_clock_set(with_clock_set(arrivals_of(run_of()), by_s, from_s=0.0), -by_s)
+    fed = whole(arrivals)
+    assert complaints(arrivals, fed) == []
+    misled = by_s < 10.0  # else the IMU has yet to reach the first of them
+    assert fed.events.count("gnss was used at wrong times: restarts") == misled
+    assert not any("position jump" in e for e in fed.events)
+    assert largest_m(fed, begin_ns) < largest_m(undisturbed(), begin_ns) + 0.5  # of a vessel that goes 2.5 m/s
+
+
+def largest_m(fed: Fed, begin_ns: int) -> float:
+    """Return the largest error from two seconds after the clock was set."""
+    since_ns = begin_ns + (SET_S + 2.0) * 1e9
+    return max(m for e, m in zip(fed.estimates, fed.errors_m, strict=True) if e.stamp_ns >= since_ns)
+
+
 def taken_of(off_s: Callable[[float], float | None], until_s: float) -> tuple[list[Measurement], list[str]]:
     """What a clock that is `off_s` makes of fixes at 4 Hz, numbered by fourths of a second; None: the receiver is silent."""
     clock, taken, events = SensorClock(), list[Measurement](), list[str]()
@@ -91,9 +110,9 @@ def taken_of(off_s: Callable[[float], float | None], until_s: float) -> tuple[li
     for n in range(round(until_s * HZ)):
         if (by_s := off_s(n / HZ)) is not None:
             m = replace(fix, stamp_ns=round((n / HZ + by_s) * 1e9), seq=n)
-            found, said = clock.take(m, round((n / HZ + 0.02) * 1e9))
-            taken += found
-            events += [said] if said else []
+            now = clock.take(m, round((n / HZ + 0.02) * 1e9))
+            taken += now.found
+            events += [now.said] if now.said else []
     return taken, events
 
 
@@ -170,10 +189,10 @@ def test_what_only_looks_like_a_leap_passes_as_it_comes(
         t_s = n / HZ
         m = replace(fix, stamp_ns=round(stamp(t_s) * 1e9), seq=n)
         newest_ns = round(50.0 * imu(arrives(t_s))) * 20_000_000
-        found, said = clock.take(m, newest_ns)
+        now = clock.take(m, newest_ns)
         sent.append(m)
-        taken += found
-        assert not said
+        taken += now.found
+        assert not now.said
     assert [m.seq for m in (*taken, *clock.left())] == list(range(100))
     assert all(a.stamp_ns == b.stamp_ns for a, b in zip(taken, sent, strict=False))
 
@@ -221,8 +240,7 @@ def test_messages_that_come_late_are_no_leap(late_s: Callable[[Array, np.random.
         came_s = t_s + late_s(t_s, rng)
         for n in np.argsort(came_s, kind="stable"):
             m = replace(fix, stamp_ns=round(t_s[n] * 1e9), seq=int(n))
-            _, said = clock.take(m, int(came_s[n] * 100.0) * 10_000_000)
-            assert not said
+            assert not clock.take(m, int(came_s[n] * 100.0) * 10_000_000).said
 
 
 def test_a_leap_is_told_from_messages_that_take_longer_or_shorter() -> None:
@@ -232,5 +250,5 @@ def test_a_leap_is_told_from_messages_that_take_longer_or_shorter() -> None:
     for n in range(100):
         t_s = n / HZ
         m = replace(fix, stamp_ns=round((t_s + (2.0 if n >= 50 else 0.0)) * 1e9), seq=n)
-        taken += clock.take(m, round(50.0 * (t_s + rng.uniform(0.0, 0.08))) * 20_000_000)[0]
+        taken += clock.take(m, round(50.0 * (t_s + rng.uniform(0.0, 0.08))) * 20_000_000).found
     assert [m.stamp_ns for m in taken] == [round(n / HZ * 1e9) for n in range(100)]

@@ -182,13 +182,31 @@ class OnlineSmoother:
         if m.sensor not in self._setup.measuring:
             self._ignore(m, _NOT_ASKED)
             return None
-        newest, found = self._intake.newest, [m]
-        if newest is not None:
-            found, said = self._persistent.clocks[m.sensor].take(m, newest.stamp_ns)
-            self._say(said)
-        for right in found:
+        newest = self._intake.newest
+        if newest is None:
+            self._take(m)
+            return None
+        taken = self._persistent.clocks[m.sensor].take(m, newest.stamp_ns)
+        self._say(taken.said)
+        made = self._put_right(m.sensor, taken.earlier_off_ns) if taken.earlier_off_ns else None
+        for right in taken.found:
             self._take(right)
-        return None
+        return made
+
+    def _put_right(self, sensor: str, off_ns: int) -> Estimate | None:
+        """Put right what is held of a sensor whose stamps were ahead by so much; an estimate that it has misled starts anew."""
+
+        def right(m: Measurement) -> Measurement:
+            return replace(m, stamp_ns=m.stamp_ns - off_ns) if m.sensor == sensor else m
+
+        tracking = self._tracking
+        if tracking is None:
+            for m in self._waiting.taken():
+                self._waiting.hold(right(m))
+            return None
+        came = [right(m) for m in tracking.since(tracking.lag.first_ns)]
+        self._persistent.receivers.pop(sensor, None)
+        return self._start_over(tracking, tracking.lag.first_ns, f"{sensor} was used at wrong times", came=came)
 
     def _take(self, m: Measurement) -> None:
         """Keep a measurement, its stamp put right, until the states reach it."""
