@@ -50,6 +50,7 @@ from graphloc.build._graph import (
 )
 from graphloc.build._layout import (
     company_of,
+    height_told_better,
     jumping,
     make_problem,
     mount_of,
@@ -99,6 +100,7 @@ __all__ = [
     "constant_keys",
     "cost_of_constants",
     "every_constant",
+    "height_told_better",
     "jumping",
     "make_problem",
     "mount_of",

@@ -16,6 +16,8 @@ from graphloc.frames import Array, Datum
 from graphloc.graph import TIME_OFFSET, Attachment, Constant, FeltMotion, InertialLink, Sensor, SlowProcess
 from graphloc.measurements import Measurement
 
+_NO_HEIGHT_M2 = np.array([0.0, 0.0, 1e12])  # adds to a fix what leaves its height without weight
+
 Carry = tuple[int, Any]
 """Number of a state, and the motion preintegrated from there to a measurement."""
 
@@ -107,6 +109,11 @@ class Attaching(Protocol):
     @property
     def slow(self) -> SlowProcess | None:
         """Its slow state."""
+        ...
+
+    @property
+    def without_height(self) -> bool:
+        """Whether the heights of its fixes are not used."""
         ...
 
     @property
@@ -235,9 +242,12 @@ def _felt(problem: Sited, raw: Array, carried_to: Any, bias: Any) -> FeltMotion:
 
 
 def _slow_walk(problem: Sited, stream: Attaching, i: int) -> Array | None:
-    if stream.slow is None:
-        return None
-    return walk_between_nodes(stream.slow, problem.config.timeline.slow_period_s, stream.apart_s[i])
+    walk = None
+    if stream.slow is not None:
+        walk = walk_between_nodes(stream.slow, problem.config.timeline.slow_period_s, stream.apart_s[i])
+    if stream.without_height:
+        return _NO_HEIGHT_M2 if walk is None else walk + _NO_HEIGHT_M2
+    return walk
 
 
 def _next_slow(

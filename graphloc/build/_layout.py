@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -74,6 +75,18 @@ def slow_or_left_out(row: Sensor, config: SensorConfig, company: int) -> tuple[S
     """
     slow = row.slow(config)
     return (None, slow) if slow is not None and slow.needs_company and company < 2 else (slow, None)
+
+
+def height_told_better(config: VesselConfig, rows: Sequence[Sensor], left_out: SlowProcess | None) -> bool:
+    """Whether a known height (a waterline) is known better than fixes tell it whose slow error is left out: then theirs are not used.
+
+    Hundreds of them would outvote it, as if their errors were white.
+    """
+    known_m = [
+        math.hypot(block.sigma_m, block.offset_sigma_m) for row in rows if row.synthetic is not None
+        for block in config.of_kind(row.kind).values() if block.height_m is not None
+    ]  # fmt: skip
+    return left_out is not None and any(sigma_m < left_out.sigma[2] for sigma_m in known_m)
 
 
 def _gap_warning(gaps: Sequence[tuple[int, int]]) -> list[str]:
@@ -163,6 +176,7 @@ def _streams(
         row, own = by_name[name], by_sensor[name]
         t, R = mount_of(name, config, mounts)
         slow, left_out, jumps = _slow_and_jumps(row, config, own, problem.datum, company, alone=alone)
+        by_waterline = height_told_better(problem.config, rows, slow_or_left_out(row, config, company)[1])
         state, carry = _states_and_carries(own, problem.timeline, problem.links)
         constants, stamps_ns, apart_s = row.constants(config), stamps_of(own), apart_s_of(own)
         found.append(
@@ -173,6 +187,7 @@ def _streams(
                 config=config,
                 slow=slow,
                 left_out=left_out,
+                without_height=by_waterline,
                 position_jumps=jumps,
                 constants=constants,
                 shares=shared_constants(name, problem.config),

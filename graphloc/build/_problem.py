@@ -36,6 +36,7 @@ class Stream:
     Attributes:
         number: of the sensor, for keys. name, row, config: the sensor.
         slow: its slow state, or None. left_out: the slow state that it would have beside a second position sensor.
+        without_height: the heights of its fixes are not used (`height_told_better`).
         position_jumps: where it alone measures position.
         constants: that its measurements may share.
         mount: pose of the sensor from the IMU, body axes.
@@ -66,6 +67,7 @@ class Stream:
     anew: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     usual: NDArray[np.bool_] | None = None
     shares: int | None = None
+    without_height: bool = False
 
     def between(self, first: int, last: int) -> range:
         """Indices of the measurements that attach to states first..last (inclusive)."""

@@ -18,6 +18,7 @@ from graphloc.build import (
     Carry,
     asks_for_delay,
     company_of,
+    height_told_better,
     mount_of,
     rows_of,
     shared_constants,
@@ -177,7 +178,7 @@ class LiveStream:
         by_stamp: stamps (ns) and indices of the measurements that are kept, in order.
         jumps: those that the window estimates.
         told_ns: the newest stamp of its measurements. anew_ns: that of the newest before its slow error was last drawn anew.
-        shares: as of a `build.Stream`.
+        shares, without_height: as of a `build.Stream`.
     """
 
     number: int
@@ -202,6 +203,7 @@ class LiveStream:
     told_ns: int = 0
     anew_ns: int | None = None
     shares: int | None = None
+    without_height: bool = False
 
     @property
     def frozen(self) -> bool:
@@ -380,6 +382,7 @@ def _live_stream(
         config=config,
         slow=slow,
         left_out=left_out,
+        without_height=height_told_better(setup.config, setup.rows, left_out),
         constants=row.constants(config),
         shares=shared_constants(name, setup.config),
         mount=gtsam.Pose3(gtsam.Rot3(R), t - t_body_imu_m),

@@ -408,7 +408,7 @@ class OnlineSmoother:
         for said in started.warnings:
             self._say(said)
         for stream in tracking.lag.problem.streams.values():
-            for said in slow_error_warning(stream.name, stream.left_out):
+            for said in slow_error_warning(stream.name, stream.left_out, without_height=stream.without_height):
                 self._say(said)
 
     def _restart(self, why: str) -> None:

@@ -62,13 +62,13 @@ def widen_heading(cov: Array, heading_var: Array | float) -> None:
 def untold_errors(streams: Sequence[Any]) -> dict[str, SlowProcess]:
     """Return the slow errors (east, north, up) that nothing can tell from motion, by sensor.
 
-    Without that of the height where the height is known otherwise: fixes that contradict it lose their weight, and turn nothing. Where
-    it was taken from the fixes, it is as far off as they are.
+    Without that of heights which are not used (`Stream.without_height`).
     """
-    known = any(s.row.synthetic is not None and s.config.height_m is not None for s in streams)
-    told = np.array([1.0, 1.0, 0.0 if known else 1.0])
-    left_out = {stream.name: stream.left_out for stream in streams if stream.left_out is not None}
-    return {name: replace(slow, sigma=slow.sigma * told) for name, slow in left_out.items()}
+    return {
+        s.name: replace(s.left_out, sigma=s.left_out.sigma * [1.0, 1.0, not s.without_height])
+        for s in streams
+        if s.left_out is not None
+    }
 
 
 def unmodelled_covariance(streams: Sequence[Any]) -> Array:

@@ -35,16 +35,19 @@ _UNAIDED_S = 30.0  # at an end of the run, from which the IMU alone is metres of
 _LEVELS_M = 0.5  # sigma, for levels that may be the usual ones as well: said from there on
 
 
-def slow_error_warning(sensor: str, left_out: SlowProcess | None) -> list[str]:
-    """Say what a slow error that nothing can tell from motion does to the bounds; nothing if it is that of RTK."""
-    if left_out is None or left_out.sigma[0] < _SMALL_M:
-        return []
-    included = (
-        f"the bounds include {left_out.sigma[0]:.2g} m (1 sigma) for it: slow_error.horizontal_sigma_m (RTK: 0.03)"
-    )
-    return [
-        f"{sensor}: no second sensor measures position or velocity, so its drift (multipath) cannot be told from motion; {included}"
-    ]
+def slow_error_warning(sensor: str, left_out: SlowProcess | None, *, without_height: bool) -> list[str]:
+    """Say what a slow error that nothing can tell from motion does to the bounds, and to its heights; nothing if it is that of RTK."""
+    said = list[str]()
+    if left_out is not None and left_out.sigma[0] >= _SMALL_M:
+        said.append(
+            f"{sensor}: no second sensor measures position or velocity, so its drift (multipath) cannot be told from motion; "
+            f"the bounds include {left_out.sigma[0]:.2g} m (1 sigma) for it: slow_error.horizontal_sigma_m (RTK: 0.03)"
+        )
+    if without_height:
+        said.append(
+            f"{sensor}: its heights are not used: height_m of the height is known better than slow_error.vertical_sigma_m"
+        )
+    return said
 
 
 def disagreement_warning(sensor: str, weights: Array) -> list[str]:
@@ -324,7 +327,7 @@ def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     else:
         warnings += _turned_mount(stream, result)
     warnings += late_far_off(stream.name, stream.slow, late_of(stream, result.values) or 0.0)
-    warnings += slow_error_warning(stream.name, stream.left_out)
+    warnings += slow_error_warning(stream.name, stream.left_out, without_height=stream.without_height)
     allowed = stream.left_out is not None
     warnings += jump_warnings(stream.name, *stream.position_jumps, allowed=allowed, followed=stream.slow is None)
     verdicts = [result.verdicts[(stream.number, i)] for i in range(len(stream.measurements))]
