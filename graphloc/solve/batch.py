@@ -240,16 +240,17 @@ class _Underway:
             excluded headings. Else None.
         """
         as_stated, misfit = self.solved.choice(), self.solved.misfit()
+        left = misfit
         for _ in range(_MAX_NOISE_ROUNDS):
-            contradicted = self.solved.misfit() >= CONTRADICTION
+            contradicted = left >= CONTRADICTION
             noisier = self._with_noisier_imu(contradicted=contradicted)
             if noisier is None:
                 break
             if self.begun.start.by_motion and not contradicted:
                 return replace(noisier, usual_motion=None)
             self._settle_with(noisier, gently=contradicted)
+            left = self.solved.misfit()
         scaled = self.solved.problem.noise_scale > as_stated.problem.noise_scale
-        left = self.solved.misfit()
         if scaled and CONTRADICTION <= left and misfit < _EXPLAINED * left:
             del self.solved  # and its graph, before the next one is made
             self._go_on_with(as_stated.settled_again(self.begun.prior, self._progress))
