@@ -46,8 +46,8 @@ class _Recovered:
     def of(self, names: Sequence[int]) -> Array:
         """Return the joint covariance of variables that are in one clique: in that of which the first eliminated one is its own."""
         cov, rows = self._cliques[min(names, key=self._when.__getitem__)]
-        picked = [row for key in names for row in rows[key]]
-        return np.asarray(cov[picked][:, picked])
+        picked = np.array([row for key in names for row in rows[key]])
+        return cov.take(picked, axis=0).take(picked, axis=1)
 
     def add(self, conditional: Any) -> None:
         """Add a clique, by what it says of its own variables given those of its parent, which is known."""
