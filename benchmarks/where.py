@@ -23,15 +23,14 @@ _PERIOD_S, _RUNS = 0.002, 5
 # The innermost of these functions that is on the stack has the sample.
 _STEPS = {
     "optimize": "GTSAM's steps (QR, all windows and passes)",
-    "bayes_tree": "GTSAM's trees (QR; for covariances)",
+    "marginals": "covariances (QR, Python)",
     "full_step": "GTSAM's steps (QR, all windows and passes)",
-    "predicted_covariance": "covariances of predictions (GTSAM)",
     "build_graph": "graphs built of the measurements (Python, GTSAM's constructors)",
     "attach": "measurements attached (Python)",
     "weigh": "measurements weighed: residuals, modes (Python, numpy)",
     "offsets_of": "offsets of sensors examined (scipy)",
     "make_problem": "timeline and preintegration",
-    "make_solution": "covariances of every pose, ledger, health (GTSAM, Python)",
+    "make_solution": "ledger, health, bounds (Python)",
     "smooth": "the rest of the solver",
 }
 _REST = "outside of the solver"

@@ -63,28 +63,36 @@ def _axis(at: Attachment) -> tuple[Array, Array, Array]:
     return R, x_body, R @ x_body
 
 
-def _read(at: Attachment, config: CompassConfig, yaw: float) -> tuple[float, Array, float]:
-    """Return the predicted reading, rad, and its derivatives by the slow state (k,) and by yaw."""
+def _read(at: Attachment, config: CompassConfig, yaw: float) -> tuple[float, Array]:
+    """Return the predicted reading, rad, and its derivative by the slow state (k,)."""
     if at.slow_value is None:
-        return yaw, np.zeros(0), 1.0
+        return yaw, np.zeros(0)
     s, c = math.sin(yaw), math.cos(yaw)
-    there = _sigmas(config) > 0.0
-    terms = np.array([1.0, c, s, 2.0 * s * c, s * s - c * c, 1.0])[there]
-    slopes = np.array([0.0, -s, c, 2.0 * (c * c - s * s), 4.0 * s * c, 0.0])[there]
-    return yaw + float(terms @ at.slow_value), terms, 1.0 + float(slopes @ at.slow_value)
+    terms = np.array([1.0, c, s, 2.0 * s * c, s * s - c * c, 1.0])[_sigmas(config) > 0.0]
+    return yaw + float(terms @ at.slow_value), terms
+
+
+def _slope(at: Attachment, config: CompassConfig, yaw: float) -> float:
+    """Return the derivative of the reading by yaw."""
+    if at.slow_value is None:
+        return 1.0
+    s, c = math.sin(yaw), math.cos(yaw)
+    slopes = np.array([0.0, -s, c, 2.0 * (c * c - s * s), 4.0 * s * c, 0.0])[_sigmas(config) > 0.0]
+    return 1.0 + float(slopes @ at.slow_value)
 
 
 def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple[Residual, ...]:
     """Return predicted - measured (1,), rad."""
     R, x_body, x = _axis(at)
-    read, terms, slope = _read(at, config, math.atan2(x[1], x[0]))
+    yaw = math.atan2(x[1], x[0])
+    read, terms = _read(at, config, yaw)
     raw = np.array([math.remainder(read - m.yaw_rad, math.tau)])
     sigma = max(m.sigma_rad, _FLOOR_RAD)
     return (
         Residual(
             raw=raw,
             cov=np.array([[sigma**2]]),
-            jacobian=lambda: slope * _yaw_jacobian(R, x_body, x)[None, :],
+            jacobian=lambda: _slope(at, config, yaw) * _yaw_jacobian(R, x_body, x)[None, :],
             slow_jacobian=lambda: terms[None, :],
             prior=1.0,
             size_m=None,

@@ -102,7 +102,7 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
             prior=1.0,
             size_m=math.hypot(raw[0], raw[1]),
             size_deg=None,
-            expected_nis=float((np.diagonal(white) / np.diagonal(cov))[: 3 if m.has_height else 2].sum()),
+            expected_nis=float((white.diagonal() / cov.diagonal())[: 3 if m.has_height else 2].sum()),
         ),
     )
 
@@ -157,7 +157,10 @@ def ideal(at: Attachment, config: GnssConfig) -> GnssPosition:
 def _antenna_jacobian(at: Attachment, config: GnssConfig) -> Array:
     """d(p + R (l + o) + u tau) / d(body tangent), (3, 6)."""
     R, (late, off) = at.T_world_body.rotation().matrix(), late_and_off(at, config)
-    return np.hstack([-R @ skew(at.T_state_sensor.transformFrom(off) + late * at.swing_mps(off)), R])
+    arm = at.T_state_sensor.transformFrom(off)
+    if late:
+        arm = arm + late * at.swing_mps(off)
+    return np.hstack([-R @ skew(arm), R])
 
 
 def hint(m: GnssPosition, mount_yaw_rad: float, datum: Datum) -> Hint:

@@ -160,7 +160,7 @@ def _stated(m: PoseFix) -> float:
 
 def _false_probability(m: PoseFix, config: AnyPoseConfig) -> float:
     """Return the front-end's own probability of 'none of the modes' where it states one, else the configured share."""
-    return float(np.clip(m.none_probability if m.none_probability > 1e-6 else config.false_fraction, 1e-4, 0.99))
+    return min(max(m.none_probability if m.none_probability > 1e-6 else config.false_fraction, 1e-4), 0.99)
 
 
 def false(m: PoseFix, config: AnyPoseConfig) -> FalseModel:

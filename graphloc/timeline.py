@@ -39,7 +39,7 @@ class Timeline:
 
     def nearest(self, stamp_ns: int) -> int:
         """Return the state nearest to a stamp."""
-        right = int(np.clip(np.searchsorted(self.stamps_ns, stamp_ns), 1, len(self) - 1))
+        right = min(max(int(np.searchsorted(self.stamps_ns, stamp_ns)), 1), len(self) - 1)
         left = right - 1
         return left if stamp_ns - self.stamps_ns[left] <= self.stamps_ns[right] - stamp_ns else right
 

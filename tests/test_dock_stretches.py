@@ -11,7 +11,7 @@ from graphloc.eval.simulate import find_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
 from graphloc.solve._grow import grow
-from graphloc.solve._optimize import bayes_tree
+from graphloc.solve._marginals import marginals
 from graphloc.solve._start import solve_start
 from graphloc.solve.alignment import align
 from graphloc.solve.decide import Stage, decisions, weigh
@@ -59,22 +59,20 @@ def test_the_past_says_of_a_state_what_the_whole_stretch_says_without_what_comes
     here = gtsam.Values(values)
     for _ in range(6):  # until the tails of the constants' priors stand
         step = solve_stretch(problem, here, first, stop, prior, decisions(verdicts), tol=1e-9)
-    whole = bayes_tree(step.graph, step.values)
+    whole = marginals(step.graph, step.values)
     for k in (int(np.searchsorted(slow_of, slow_of[at])) for at in (first + 20, first + 60, stop - 30)):
         past = past_at(problem, step, k)
         rest, at = build_graph(problem, step.values, decisions(verdicts), k, stop, past)
         assert sum(chr(key >> 56) == "c" for key in past.known) == 3  # each tag's place in the survey
         at.update(step.values.extract([key for key in list(at.keys()) if keys.is_leaf(key)]))
-        later = bayes_tree(rest, at)
+        later = marginals(rest, at)
         np.testing.assert_allclose(
-            [later.calculateBestEstimate().atPose3(keys.pose(n)).translation() for n in (k, stop)],
+            [later.values.atPose3(keys.pose(n)).translation() for n in (k, stop)],
             [step.values.atPose3(keys.pose(n)).translation() for n in (k, stop)],
             atol=1e-3,
         )
         for key in [*state_keys(problem, k, k + 3), *state_keys(problem, stop, stop), *past.known]:
-            np.testing.assert_allclose(
-                later.marginalCovariance(key), whole.marginalCovariance(key), rtol=1e-3, atol=1e-9
-            )
+            np.testing.assert_allclose(later.cov[key], whole.cov[key], rtol=1e-3, atol=1e-9)
         # A place and what GNSS is off there (place less fix) are hardly known apart; together they are.
         gnss = next(s for s in problem.streams if s.name == "gnss")
         joint = _joint(past.factors, step.values, [keys.pose(k), keys.slow(gnss.number, int(slow_of[k]))])
@@ -82,7 +80,7 @@ def test_the_past_says_of_a_state_what_the_whole_stretch_says_without_what_comes
         place, off, both = turn @ joint[3:6, 3:6] @ turn.T, joint[6:, 6:], turn @ joint[3:6, 6:]
         fix = place + off - both - both.T
         assert np.trace(fix[:2, :2]) < 0.5 * np.trace((place + off)[:2, :2])
-        assert joint[3, 3] > 1.1 * whole.marginalCovariance(keys.pose(k))[3, 3]  # what comes later is not in it
+        assert joint[3, 3] > 1.1 * whole.cov[keys.pose(k)][3, 3]  # what comes later is not in it
 
 
 def _joint(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, names: list[int]) -> Array:

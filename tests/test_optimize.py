@@ -11,7 +11,8 @@ from graphloc import keys
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.solve import _on_deep_stack, _passes
-from graphloc.solve._optimize import bayes_tree, full_step, optimize
+from graphloc.solve._marginals import marginals
+from graphloc.solve._optimize import full_step, optimize
 from graphloc.solve.stretch import moved
 
 
@@ -82,7 +83,7 @@ def test_a_fault_of_ours_is_not_put_on_the_data() -> None:
     """A graph that asks for a state which nobody has guessed."""
     graph, guess = loop(1.0)
     graph.add(gtsam.BetweenFactorPose2(0, 99, gtsam.Pose2(), gtsam.noiseModel.Unit.Create(3)))
-    for solve in (lambda: full_step(graph, guess), lambda: bayes_tree(graph, guess)):
+    for solve in (lambda: full_step(graph, guess), lambda: marginals(graph, guess)):
         with pytest.raises(SolveError, match=r": a fault in graphloc, not in the data; .* RuntimeError: .*99") as error:
             solve()
         assert not any(word in str(error.value) for word in ("undetermined", "measurements", "inspect"))
@@ -94,7 +95,7 @@ def test_full_step_solves_a_linear_problem_and_gives_its_covariance() -> None:
     graph.add(gtsam.PriorFactorVector(0, np.array([3.0, 2.0]), gtsam.noiseModel.Isotropic.Sigma(2, 0.5)))
     guess.insert(0, np.array([100.0, -50.0]))
     np.testing.assert_allclose(full_step(graph, guess).atVector(0), [2.0, 2.0], atol=1e-9)
-    np.testing.assert_allclose(bayes_tree(graph, guess).marginalCovariance(0), np.eye(2) * 0.125, atol=1e-12)
+    np.testing.assert_allclose(marginals(graph, guess).cov[0], np.eye(2) * 0.125, atol=1e-12)
 
 
 def test_a_step_that_came_out_as_promised_is_the_last() -> None:

@@ -1,4 +1,4 @@
-"""What the solver lets go of before it asks for more: memory that is free goes back, trees and graphs with it."""
+"""What the solver lets go of before it asks for more: memory that is free goes back, graphs with it."""
 
 import ctypes
 import os
@@ -74,16 +74,13 @@ def test_where_none_can_be_given_back_nothing_happens(library: object, monkeypat
     give_back_memory()
 
 
-def test_a_result_without_tree_and_graph_is_the_same_otherwise(problem: Problem) -> None:
+def test_a_result_without_its_graph_is_the_same_otherwise(problem: Problem) -> None:
     result = solve_batch(problem)
     light = result.lightened()
     assert light.graph.size() == 0
-    assert light.tree.getFactorsUnsafe().size() == 0
-    assert light.tree.empty()
     assert result.graph.size() > len(problem.timeline.stamps_ns)  # the whole one is left as it is
-    assert not result.tree.empty()
     for field in fields(BatchResult):
-        if field.name not in ("tree", "graph"):
+        if field.name != "graph":
             assert getattr(light, field.name) is getattr(result, field.name), field.name
     asked, whole = offsets_of(light, PROBE), offsets_of(result, PROBE)
     assert asked is not None
@@ -92,7 +89,7 @@ def test_a_result_without_tree_and_graph_is_the_same_otherwise(problem: Problem)
     np.testing.assert_array_equal(asked.curvature, whole.curvature)
 
 
-def test_tree_and_graph_are_gone_before_memory_is_given_back_and_offsets_are_asked(
+def test_the_graph_is_gone_before_memory_is_given_back_and_offsets_are_asked(
     problem: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held: list[weakref.ref[Any]] = []
@@ -100,7 +97,7 @@ def test_tree_and_graph_are_gone_before_memory_is_given_back_and_offsets_are_ask
 
     def solved(*arguments: Any, **options: Any) -> BatchResult:
         result = solve_batch(*arguments, **options)
-        held.extend((weakref.ref(result.tree), weakref.ref(result.graph)))
+        held.append(weakref.ref(result.graph))
         return result
 
     def noted(what: str, then: Callable[..., Any]) -> Callable[..., Any]:
@@ -115,7 +112,7 @@ def test_tree_and_graph_are_gone_before_memory_is_given_back_and_offsets_are_ask
     monkeypatch.setattr(graphloc.solve, "offsets_of", noted("asked", offsets_of))
     run = simulate(Scenario(duration_s=12.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 1)
     smooth(run.recording, run.config, problem.datum, rows=SENSORS, inertial=INERTIAL, probe=PROBE)
-    assert len(held) == 2
+    assert len(held) == 1
     assert said == ["given back: 0 held", "asked: 0 held"]
 
 

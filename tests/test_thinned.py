@@ -11,7 +11,8 @@ from graphloc.build import Decided, Problem, Thinned, attach, build_graph, make_
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.graph import Decision
-from graphloc.solve._optimize import bayes_tree, optimize
+from graphloc.solve._marginals import Marginals, marginals
+from graphloc.solve._optimize import optimize
 from graphloc.solve.stretch import weak_prior
 
 
@@ -43,8 +44,8 @@ def usual() -> tuple[Problem, gtsam.Values, Thinned]:
     return problem, values, thinned(problem)
 
 
-def solved(problem: Problem, values: gtsam.Values, chosen: dict[int, list[int]]) -> tuple[gtsam.Values, gtsam.ISAM2]:
-    """The solution with these measurements, all believed, and its tree."""
+def solved(problem: Problem, values: gtsam.Values, chosen: dict[int, list[int]]) -> tuple[gtsam.Values, Marginals]:
+    """The solution with these measurements, all believed, and its covariances."""
     prior, last = weak_prior(problem, values, 0), len(problem.timeline) - 1
     for _ in range(3):  # where measurements attach follows the estimate
         decided = {
@@ -54,7 +55,7 @@ def solved(problem: Problem, values: gtsam.Values, chosen: dict[int, list[int]])
         }
         graph, guess = build_graph(problem, values, decided, 0, last, prior, jumps=False)
         values = optimize(graph, guess, 20, 1e-9).values
-    return values, bayes_tree(graph, values)
+    return values, marginals(graph, values)
 
 
 def test_a_thinned_run_says_of_its_states_what_the_whole_one_says_with_the_same_measurements() -> None:
@@ -62,11 +63,11 @@ def test_a_thinned_run_says_of_its_states_what_the_whole_one_says_with_the_same_
     assert len(few.states) < 0.5 * len(problem.timeline)
     # As thin, each measurement stands for a second of its slow error's walk; alike, they must be as many.
     spaced = tuple(replace(s, apart_s=np.full(len(s.measurements), np.inf)) for s in problem.streams)
-    whole, whole_tree = solved(
+    whole, whole_said = solved(
         replace(problem, streams=spaced), values, {number: few.chosen[number].tolist() for number in few.chosen}
     )
     every = {s.number: list(range(len(s.measurements))) for s in few.problem.streams}
-    thin, thin_tree = solved(few.problem, few.of(values), every)
+    thin, thin_said = solved(few.problem, few.of(values), every)
     for k, at in enumerate(few.states.tolist()):
         one, other = thin.atPose3(keys.pose(k)), whole.atPose3(keys.pose(at))
         apart = other.localCoordinates(one)
@@ -74,7 +75,7 @@ def test_a_thinned_run_says_of_its_states_what_the_whole_one_says_with_the_same_
         assert np.abs(apart[3:]).max() < 0.005
         np.testing.assert_allclose(thin.atVector(keys.velocity(k)), whole.atVector(keys.velocity(at)), atol=0.005)
         if k % 5 == 0:
-            mine, theirs = thin_tree.marginalCovariance(keys.pose(k)), whole_tree.marginalCovariance(keys.pose(at))
+            mine, theirs = thin_said.cov[keys.pose(k)], whole_said.cov[keys.pose(at)]
             np.testing.assert_allclose(np.sqrt(np.diagonal(mine)), np.sqrt(np.diagonal(theirs)), rtol=0.01)
 
 

@@ -224,7 +224,7 @@ def _heading(
     problem = result.problem
     last = keys.pose(len(problem.timeline) - 1)
     R = result.values.atPose3(last).rotation().matrix()
-    linear_var = world_covariance(result.tree.marginalCovariance(last), R, np.zeros(3))[5, 5]
+    linear_var = world_covariance(result.cov[last], R, np.zeros(3))[5, 5]
     sigma = min(float(np.sqrt(max(linear_var, result.heading_var[-1]))), ANY_HEADING_RAD)
     last_ns, drift_radps = int(problem.timeline.stamps_ns[-1]), _vertical_bias_sigma(problem.R_body_imu, result)
     if setup.config.start.heading_deg is not None and not _measured(setup, recording, datum):

@@ -17,7 +17,7 @@ import numpy as np
 
 from graphloc.build import Decisions, Problem, StartPrior, Thinned, build_graph
 from graphloc.graph import Decision
-from graphloc.solve._optimize import bayes_tree
+from graphloc.solve._marginals import Marginals, marginals
 from graphloc.solve._passes import SETTLED_M, SETTLED_WEIGHT, Settled, changed
 from graphloc.solve.decide import (
     Stage,
@@ -27,7 +27,7 @@ from graphloc.solve.decide import (
     decisions,
     decisions_on,
     log_evidence,
-    predicted_covariance,
+    predicted_by,
     weigh,
 )
 from graphloc.solve.stretch import copy_states, solve_until_written_there, update_states, weak_prior
@@ -79,7 +79,7 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
             first=0,
             last=len(problem.timeline) - 1,
             stage=Stage.FINAL,
-            covariance=predicted_covariance(rest.tree),
+            covariance=predicted_by(rest.cov),
             only=own,
         )
         for (number, i), verdict in fresh.items():
@@ -88,7 +88,6 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
             residual = stream.row.residuals(stream.measurements[i], stream.config, at)[verdict.mode]
             judged[key] = _decisive(replace(verdict, at=at, residual=residual))
         iterations += 1
-        del rest  # and its tree, before the next one is made
     return judged, iterations
 
 
@@ -112,20 +111,12 @@ def _without_its_ends(problem: Problem, settled: Settled) -> Verdicts:
     return others
 
 
-class Rest(NamedTuple):
-    """The run without some measurements: values, and the tree that gives their covariances."""
-
-    values: gtsam.Values
-    tree: gtsam.ISAM2
-
-
 def without(
     problem: Problem, estimate: gtsam.Values, decided: Decisions, prior: StartPrior, left_out: set[tuple[int, int]]
-) -> Rest:
+) -> Marginals:
     """Take one step of the whole run without some measurements."""
     kept = {key: found for key, found in decided.items() if key not in left_out}
-    tree = bayes_tree(*build_graph(problem, estimate, kept, 0, len(problem.timeline) - 1, prior))
-    return Rest(gtsam.Values(tree.calculateBestEstimate()), tree)
+    return marginals(*build_graph(problem, estimate, kept, 0, len(problem.timeline) - 1, prior))
 
 
 def _decisive(verdict: Verdict) -> Verdict:

@@ -9,7 +9,7 @@ same. If these are false, the vessel is where that run has it, or as far off as 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import gtsam
@@ -28,7 +28,7 @@ from graphloc.solution import Graded
 from graphloc.solve._choices import without
 from graphloc.solve.batch import BatchResult
 from graphloc.solve.covariances import world_covariance
-from graphloc.solve.decide import Verdict, decisions_on, met, predicted, predicted_covariance
+from graphloc.solve.decide import Verdict, decisions_on, met, predicted, predicted_by
 from graphloc.solve.hypotheses import log_right_and_false
 from graphloc.solve.prediction import taken_of
 from graphloc.time import stamps_of
@@ -90,8 +90,8 @@ def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
         if not any(doubt.probability.max() > _SLIGHT for doubt in doubts.values()):
             continue
         if sure is None:
-            tree = without(few.problem, values, decided, result.prior, set()).tree
-            sure = np.array([_plane_covariance(few, tree, values, k) for k in range(len(few.states))])
+            known = without(few.problem, values, decided, result.prior, set()).cov
+            sure = np.array([_plane_covariance(few, known, values, k) for k in range(len(few.states))])
         off = apart.planes - _planes(few, values)
         off[:, 2] = wrap_angle(off[:, 2])
         stamps_ns, known_ns = result.problem.timeline.stamps_ns, few.problem.timeline.stamps_ns
@@ -160,14 +160,13 @@ def _judged_apart(
         rest = without(few.problem, values, decided, result.prior, {(stream.number, i) for i in around.tolist()})
         own = np.flatnonzero(third_of_state == third)
         planes[own] = _planes(few, rest.values)[own]
-        cov[own] = [_plane_covariance(few, rest.tree, rest.values, k) for k in own.tolist()]
-        covariance, mine = predicted_covariance(rest.tree), np.flatnonzero(third_of == third).tolist()
+        cov[own] = [_plane_covariance(few, rest.cov, rest.values, k) for k in own.tolist()]
+        covariance, mine = predicted_by(rest.cov), np.flatnonzero(third_of == third).tolist()
         for n, at, found in zip(mine, *met(few.problem, stream, mine, rest.values), strict=True):
             prediction, mode = predicted(found, at, int(stream.state[n]), covariance), verdicts[n].mode
             P, by_plane = None if prediction is None else prediction.cov, _by_plane(found[mode], at)
             for aspect, axes in _ASPECTS.items():
                 false[aspect][n] = probability_false(found, P, models[n], mode, by_plane, axes)
-        del rest, covariance  # and the tree, before the next one is made
     return _Apart(planes, cov, false)
 
 
@@ -259,10 +258,10 @@ def _planes(few: Thinned, values: gtsam.Values) -> Array:
     return np.array([[*pose.transformFrom(lever_m)[:2], pose.rotation().yaw()] for pose in poses])
 
 
-def _plane_covariance(few: Thinned, tree: gtsam.ISAM2, values: gtsam.Values, k: int) -> Array:
+def _plane_covariance(few: Thinned, known: Mapping[int, Array], values: gtsam.Values, k: int) -> Array:
     """Return the covariance (3, 3) of that in state k."""
     R = values.atPose3(keys.pose(k)).rotation().matrix()
-    found = world_covariance(tree.marginalCovariance(keys.pose(k)), R, -few.problem.t_body_imu_m)
+    found = world_covariance(known[keys.pose(k)], R, -few.problem.t_body_imu_m)
     return np.asarray(found[np.ix_(_PLANE, _PLANE)])
 
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from graphloc.build import Past, Problem, StartPrior, without_imu
 from graphloc.recording import Progress
-from graphloc.solve._optimize import bayes_tree
+from graphloc.solve._marginals import marginals
 from graphloc.solve._passes import cost_as_configured
-from graphloc.solve.decide import PredictedCovariance, Stage, Verdicts, agrees, decisions, predicted_covariance, weigh
+from graphloc.solve.decide import PredictedCovariance, Stage, Verdicts, agrees, decisions, predicted_by, weigh
 from graphloc.solve.stretch import (
     StretchStep,
     copy_states,
@@ -112,7 +112,7 @@ def _solve_grown(window: GrownWindow) -> tuple[int, StretchStep, Verdicts]:
     step, verdicts, iterations = _solve_without(window, fresh)
     if not fresh:
         return iterations, step, verdicts
-    predicted = predicted_covariance(bayes_tree(step.graph, step.values))
+    predicted = predicted_by(marginals(step.graph, step.values).cov)
     covariance: PredictedCovariance = lambda k, key: predicted(k, key) if k > known else None
     for _ in range(2):
         verdicts = weigh(problem, values, first=first, last=last, stage=Stage.FINAL, covariance=covariance)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GTSAM's optimiser and covariances, with settings that are stable with chains of slow biases."""
+"""GTSAM's optimiser, with settings that are stable with chains of slow biases."""
 
 from __future__ import annotations
 
@@ -107,20 +107,3 @@ def full_step(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> gtsam.V
         return _of(stepper)
     except RuntimeError as error:
         raise not_solved("the solver failed", error) from error
-
-
-def bayes_tree(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.ISAM2:
-    """Return an ISAM2 that holds the graph linearised at `values`, for covariances (`Marginals` has no QR).
-
-    Raises:
-        SolveError: a state is not determined.
-    """
-    params = gtsam.ISAM2Params()
-    params.setFactorization("QR")
-    params.cacheLinearizedFactors = False  # nothing is updated a second time
-    tree = gtsam.ISAM2(params)
-    try:
-        tree.update(graph, values)
-    except RuntimeError as error:
-        raise not_solved("the covariance could not be computed", error) from error
-    return tree

@@ -21,6 +21,7 @@ from graphloc.signals.series import interpolated
 from graphloc.solution import SlowEstimate, Solution
 from graphloc.solve._doubt import widen_by_doubt
 from graphloc.solve._drift import with_drift_taken_back
+from graphloc.solve._marginals import marginals
 from graphloc.solve.batch import BatchResult
 from graphloc.solve.covariances import (
     ANY_HEADING_RAD,
@@ -97,7 +98,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
 
 def _states_of(problem: Problem, result: BatchResult) -> _States:
     """Return the states, moved from the IMU's place to the body's origin, with the covariance of the graph and of other levels."""
-    states, values, tree = range(len(problem.timeline)), result.values, result.tree
+    states, values = range(len(problem.timeline)), result.values
     poses = [values.atPose3(keys.pose(k)) for k in states]
     R = np.array([p.rotation().matrix() for p in poses])
     bias = [values.atConstantBias(keys.bias(int(j))) for j in problem.timeline.slow_of]
@@ -105,7 +106,7 @@ def _states_of(problem: Problem, result: BatchResult) -> _States:
     raw = result.problem.links.gyro_at(problem.timeline.stamps_ns)
     gyro = raw - gyro_bias @ result.problem.R_body_imu.T
     lever = -problem.t_body_imu_m
-    cov = np.array([world_covariance(tree.marginalCovariance(keys.pose(k)), R[k], lever) for k in states])
+    cov = np.array([world_covariance(result.cov[keys.pose(k)], R[k], lever) for k in states])
     cov[:, :3, :3] += unmodelled_covariance(problem.streams) + result.levels_cov
     trajectory = Trajectory(
         stamps_ns=problem.timeline.stamps_ns,
@@ -117,7 +118,7 @@ def _states_of(problem: Problem, result: BatchResult) -> _States:
     )
     return _States(
         trajectory=trajectory,
-        v_cov=np.array([tree.marginalCovariance(keys.velocity(k)) for k in states]),
+        v_cov=np.array([result.cov[keys.velocity(k)] for k in states]),
         accel_bias_mps2=np.array([b.accelerometer() for b in bias]),
         gyro_bias_radps=gyro_bias,
         gyro_radps=gyro,
@@ -223,9 +224,8 @@ def _berth_tracks(problem: Problem, result: BatchResult, trajectory: Trajectory)
             moved = _moved(problem, result, stream, berth, trajectory.stamps_ns[picked])
             value, J = seen_from(berth, trajectory.p_world_m[picked], trajectory.yaw_rad[picked], moved)
             stamps = trajectory.stamps_ns[picked]
-            cov = np.array([
-                j @ _of_pose_and_berth(problem, result, stream, berth, int(k)) @ j.T for j, k in zip(J, picked, strict=True)
-            ])  # fmt: skip
+            joint = _of_pose_and_berth(problem, result, stream, berth, picked)
+            cov = J @ joint @ J.transpose(0, 2, 1)
             rate = rates(value, (stamps - stamps[0]) * 1e-9)
             yield BerthTrack(berth=berth, stamps_ns=stamps, value=value, rate=rate, cov=cov)
 
@@ -243,18 +243,24 @@ def _moved(problem: Problem, result: BatchResult, stream: Stream, berth: Berth, 
     return interpolated(stamps, at, held)
 
 
-def _of_pose_and_berth(problem: Problem, result: BatchResult, stream: Stream, berth: Berth, k: int) -> Array:
-    """Covariance (7, 7) of east, north, yaw of the body and of how the berth has moved: known together, not apart."""
-    R = result.values.atPose3(keys.pose(k)).rotation().matrix()
-    wanted = [keys.pose(k)]
+def _of_pose_and_berth(
+    problem: Problem, result: BatchResult, stream: Stream, berth: Berth, states: NDArray[np.int64]
+) -> Array:
+    """Covariances (N, 7, 7) of east, north, yaw of the body and of how the berth has moved: known together, not apart."""
+    poses = [keys.pose(k) for k in states.tolist()]
+    R = [result.values.atPose3(key).rotation().matrix() for key in poses]
+    if berth.moves is None:
+        joint = np.array([result.cov[key] for key in poses])
+    else:
+        nodes = problem.timeline.slow_of[states].tolist()
+        pairs = [(key, keys.slow(stream.number, j)) for key, j in zip(poses, nodes, strict=True)]
+        found = marginals(result.graph, result.values, pairs).joint
+        joint = np.array([found[pair] for pair in pairs])
+    kept = np.zeros((len(poses), 7, joint.shape[1]))
+    kept[:, :3, :6] = [to_world(turn, -problem.t_body_imu_m)[[0, 1, 5]] for turn in R]
     if berth.moves is not None:
-        wanted.append(keys.slow(stream.number, int(problem.timeline.slow_of[k])))
-    joint = np.asarray(result.tree.jointMarginalCovariance(wanted).fullMatrix())
-    kept = np.zeros((7, len(joint)))
-    kept[:3, :6] = to_world(R, -problem.t_body_imu_m)[[0, 1, 5]]
-    if berth.moves is not None:
-        kept[3:, 6 + berth.moves + _IN_PLANE] = np.eye(4)
-    return np.asarray(kept @ joint @ kept.T)
+        kept[:, 3:, 6 + berth.moves + _IN_PLANE] = np.eye(4)
+    return np.asarray(kept @ joint @ kept.transpose(0, 2, 1))
 
 
 def _slow(problem: Problem, stream: Stream, result: BatchResult) -> SlowEstimate:
@@ -262,7 +268,7 @@ def _slow(problem: Problem, stream: Stream, result: BatchResult) -> SlowEstimate
     assert process is not None
     name = [keys.slow(stream.number, j) for j in range(len(problem.timeline.slow_stamps_ns))]
     value = np.array([result.values.atVector(key) for key in name])
-    sigma = np.array([np.sqrt(np.diagonal(result.tree.marginalCovariance(key))) for key in name])
+    sigma = np.array([np.sqrt(np.diagonal(result.cov[key])) for key in name])
     return SlowEstimate(
         name=process.name,
         axes=process.axes,

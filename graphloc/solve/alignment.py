@@ -177,7 +177,7 @@ def _turns(problem: Problem, span_s: float, bias: Array) -> Callable[[float], Ar
     steps = Rotation.from_rotvec((0.5 * (w[:-1] + w[1:]) - bias) * np.diff(t)[:, None]).as_matrix()
     for i, step in enumerate(steps):
         R[i + 1] = R[i] @ step
-    return lambda s: np.asarray(R[int(np.clip(np.searchsorted(t, s), 0, len(t) - 1))])
+    return lambda s: np.asarray(R[min(int(np.searchsorted(t, s)), len(t) - 1)])
 
 
 def _level(

@@ -10,7 +10,7 @@
    jumps of the only position sensor, 1 to 4 are repeated with them (`_jumps`); where the first fixes after an outage bend the track,
    without these (`_returns`). Where the IMU's mount is clearly off, repeat 3 with it turned (`imu_mount`).
 5. Where receivers jump and no other sensor measures position, choose the most probable level (`_levels`).
-6. A Bayes tree of the last graph gives the covariances of every state.
+6. The last graph gives the covariances of every state (`_marginals`).
 
 Where no sensor measures position or velocity for a while, 3 to 6 have the motion model (`graphloc.motion_model`).
 Sensors that scatter more than they state are taken as they scatter, and 3 and 4 repeated.
@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -36,7 +35,7 @@ from graphloc.solve._final_passes import LAST_PASSES, MAX_SENSOR_ROUNDS, SolvedR
 from graphloc.solve._first_solution import first_solution
 from graphloc.solve._jumps import jumps_in, with_jumps_of, with_jumps_off_track
 from graphloc.solve._levels import at_usual_level
-from graphloc.solve._optimize import bayes_tree
+from graphloc.solve._marginals import marginals
 from graphloc.solve._passes import cost_of_run, cost_without_outliers, rough_passes
 from graphloc.solve._returns import doubtful_returns
 from graphloc.solve._start import Begun
@@ -62,7 +61,7 @@ class BatchResult:
     stated: Problem
     values: gtsam.Values
     verdicts: Verdicts
-    tree: Any
+    cov: dict[int, Array]  # of each key
     graph: gtsam.NonlinearFactorGraph
     passes: int
     iterations: int
@@ -78,8 +77,8 @@ class BatchResult:
     notes: tuple[str, ...]
 
     def lightened(self) -> BatchResult:
-        """Return the same without tree and graph, which take gigabytes on a run of hours."""
-        return replace(self, tree=gtsam.ISAM2(), graph=gtsam.NonlinearFactorGraph())
+        """Return the same without the graph, which takes gigabytes on a run of hours."""
+        return replace(self, graph=gtsam.NonlinearFactorGraph())
 
 
 def solve_batch(
@@ -241,16 +240,17 @@ class _Underway:
             excluded headings. Else None.
         """
         as_stated, misfit = self.solved.choice(), self.solved.misfit()
+        left = misfit
         for _ in range(_MAX_NOISE_ROUNDS):
-            contradicted = self.solved.misfit() >= CONTRADICTION
+            contradicted = left >= CONTRADICTION
             noisier = self._with_noisier_imu(contradicted=contradicted)
             if noisier is None:
                 break
             if self.begun.start.by_motion and not contradicted:
                 return replace(noisier, usual_motion=None)
             self._settle_with(noisier, gently=contradicted)
+            left = self.solved.misfit()
         scaled = self.solved.problem.noise_scale > as_stated.problem.noise_scale
-        left = self.solved.misfit()
         if scaled and CONTRADICTION <= left and misfit < _EXPLAINED * left:
             del self.solved  # and its graph, before the next one is made
             self._go_on_with(as_stated.settled_again(self.begun.prior, self._progress))
@@ -289,7 +289,7 @@ class _Underway:
             stated=self.stated,
             values=settled.values,
             verdicts=settled.verdicts,
-            tree=bayes_tree(settled.graph, settled.values),
+            cov=marginals(settled.graph, settled.values).cov,
             graph=settled.graph,
             passes=self.passes,
             iterations=self.iterations,

@@ -103,7 +103,8 @@ def linearised(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior
     for key, verdict in verdicts.items():
         if verdict.decision is not None:
             plain = Decision(mode=verdict.decision.mode, weight=verdict.decision.weight)
-            decided[key] = Decided(plain, _attached(problem, streams[key[0]], key[1], verdict.at, values))
+            at = _attached(problem, streams[key[0]], key[1], verdict.at, values)
+            decided[key] = Decided(plain, at, verdict.residual if at is verdict.at else None)
     graph, guess = build_graph(problem, values, decided, 0, last, prior, jumps=False, made=made)
     kernels = [
         (factors, kernel)
@@ -143,12 +144,15 @@ def sparse_rows(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tupl
 
 
 def _attached(problem: Problem, stream: Stream, i: int, at: Attachment, values: gtsam.Values) -> Attachment:
-    """Return an attachment of the solution, with the slow states and constants that the stream has here."""
+    """Return an attachment of the solution, with the slow states and constants that the stream has here: the same where they are."""
     constants = at.constants if stream.constants else ()
     if stream.slow is None:
         return replace(at, constants=constants, slow_key=None, slow_value=None, slow_next=None)
     key = keys.slow(stream.number, int(problem.timeline.slow_of[stream.state[i]]))
-    return replace(at, constants=constants, slow_key=key, slow_value=values.atVector(key))
+    value = values.atVector(key)
+    if not at.constants and at.slow_value is not None and np.array_equal(at.slow_value, value):
+        return at
+    return replace(at, constants=constants, slow_key=key, slow_value=value)
 
 
 def _jumps(problem: Problem, held: list[Any]) -> list[int]:

@@ -132,10 +132,7 @@ def _turned_mount(stream: Stream, result: BatchResult) -> list[str]:
         return []
     key = keys.slow(stream.number, 0)
     value, sigma = float(result.values.atVector(key)[k]), float(slow.sigma[k])
-    try:
-        var = float(result.tree.marginalCovariance(key)[k, k])
-    except (RuntimeError, IndexError):  # not determined
-        return []
+    var = float(result.cov[key][k, k])
     prior = sigma**2 * (1.0 + (value / sigma) ** 2 / CONSTANT_TAILS)
     told = prior - var  # what the other sensors took off it
     if told < _TOLD * prior:
