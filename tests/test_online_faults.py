@@ -31,7 +31,7 @@ from graphloc.online._setup import Setup
 from graphloc.online._window import Window
 from graphloc.solution import Health
 from graphloc.time import stamps_of
-from tests.faults import FAULTS, Arrival, Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
+from tests.faults import FAULTS, Arrival, Arrivals, Fed, arrivals_of, complaints, copied, feed, finish, numbered
 from tests.slowly import slowly
 
 RATE_HZ = 2.5  # of states
@@ -66,6 +66,18 @@ def whole(arrivals: Arrivals, online: OnlineSmoother | None = None) -> Fed:
     return finish(online, feed(online, run_of(), arrivals))
 
 
+@cache
+def _begun(t_s: float) -> tuple[OnlineSmoother, Fed]:
+    online, arrivals = smoother(run_of()), arrivals_of(run_of())
+    return online, feed(online, run_of(), arrivals[: at_s(arrivals, t_s)])
+
+
+def begun(t_s: float) -> tuple[OnlineSmoother, Fed]:
+    """A smoother that was fed the first seconds of the run, and what came of it: most of the time is the start's."""
+    online, fed = _begun(t_s)
+    return copied(online), fed.copied()
+
+
 def at_s(arrivals: Arrivals, t_s: float) -> int:
     """Index of the first arrival from a time on."""
     return next(n for n, a in enumerate(arrivals) if a.true_ns >= arrivals[0].true_ns + t_s * 1e9)
@@ -74,10 +86,25 @@ def at_s(arrivals: Arrivals, t_s: float) -> int:
 @cache
 def after_12_s() -> Lag:
     """The window after 12 s of the run; not to be changed."""
-    online, arrivals = smoother(run_of()), arrivals_of(run_of())
-    feed(online, run_of(), arrivals[: at_s(arrivals, 12.0)])
+    online, _ = begun(12.0)
     assert online._tracking is not None  # noqa: SLF001
     return online._tracking.lag  # noqa: SLF001
+
+
+def test_a_copy_goes_on_as_the_smoother_itself() -> None:
+    """So that tests can share a beginning: to the last bit, and neither changes the other."""
+    base, n = arrivals_of(run_of())[:], at_s(arrivals_of(run_of()), 10.0)
+    first, fed = begun(10.0)
+    finish(first, feed(first, run_of(), base[n:], fed))
+    second, again = begun(10.0)
+    finish(second, feed(second, run_of(), base[n:], again))
+    for one in (fed, again):
+        assert one.rows == undisturbed().rows
+        assert one.events == undisturbed().events
+        for a, b in zip(one.estimates, undisturbed().estimates, strict=True):
+            assert a.stamp_ns == b.stamp_ns
+            for name in ("p_world_m", "R_world_body", "cov", "p_odom_m"):
+                assert np.array_equal(getattr(a, name), getattr(b, name))
 
 
 QUICK = ["backward stamps", "jumping stamps", "zero stamps", "repeated", "clock back", "latitude and longitude swapped",
@@ -90,8 +117,11 @@ def test_a_fault_is_survived(name: str) -> None:
     base = arrivals_of(run_of())
     begin = base[0].true_ns + 9_000_000_000
     broken, until = FAULTS[name](base, begin, np.random.default_rng(5))
-    arrivals = numbered([a for a in broken if a.true_ns < until + 8_000_000_000])
-    fed = whole(arrivals)
+    n, (online, fed) = at_s(base, 9.0), begun(9.0)
+    assert [a.m.stamp_ns for a in broken[:n]] == [a.m.stamp_ns for a in base[:n]]
+    rest = numbered([a for a in broken[n:] if a.true_ns < until + 8_000_000_000], len(base))
+    finish(online, feed(online, run_of(), rest, fed))
+    arrivals = [*base[:n], *rest]
     assert complaints(arrivals, fed) == []
     # A clock that jumps costs a new start: 5 s of IMU data, and up to half a second until it is tried.
     assert fed.recovered_s(until) < 6.0
@@ -150,8 +180,7 @@ def test_a_start_that_fails_keeps_the_ledger_complete(monkeypatch: pytest.Monkey
 @pytest.mark.parametrize("kept", [True, False])
 def test_agreement_with_a_rejected_choice_does_not_count(kept: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """It put off the new start of an estimate 35 m aside by a minute: the right matches agreed, but only while they were tried."""
-    base, online = arrivals_of(run_of()), smoother(run_of())
-    feed(online, run_of(), base[: at_s(base, 12.0)])
+    online, _ = begun(12.0)
     assert online._tracking is not None  # noqa: SLF001
     judge, agreement = online._tracking.lag._judge, online._tracking.lag._agreement  # noqa: SLF001
     stream = online._tracking.lag.problem.streams["matcher"]  # noqa: SLF001
@@ -366,9 +395,8 @@ def test_a_measurement_let_in_by_a_wide_kernel_agrees_only_when_judged_again(
     widened: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A fix 300 m off, let in once a second as the prediction was unsure, put off the new start of a lost estimate."""
-    base, online = arrivals_of(run_of()), smoother(run_of())
+    base, (online, _) = arrivals_of(run_of()), begun(12.0)
     now, soon, later = (at_s(base, t_s) for t_s in (12.0, 12.8, 14.5))
-    feed(online, run_of(), base[:now])
     assert online._tracking is not None  # noqa: SLF001
     judge, agreement = online._tracking.lag._judge, online._tracking.lag._agreement  # noqa: SLF001
     by_kernel = judge._by_kernel  # noqa: SLF001
@@ -615,10 +643,9 @@ def test_no_window_begins_where_a_jump_was_not_known_yet() -> None:
 
 
 def test_odometry_continues_when_the_clock_is_set_back() -> None:
-    base, online = arrivals_of(run_of()), smoother(run_of())
+    base, (online, before) = arrivals_of(run_of()), begun(10.0)
     n = at_s(base, 10.0)
     back = [replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns - 3_600_000_000_000)) for a in base[n:]]
-    before = feed(online, run_of(), base[:n])
     after = feed(online, run_of(), back)
     assert [e for e in after.events if "set back" in e]
     walked = run_of().truth.at(np.array([after.true_ns[0], after.true_ns[-1]])).p_world_m
@@ -665,9 +692,8 @@ def broken_at(
 @pytest.mark.parametrize("error", [RuntimeError("planted"), MemoryError(), ValueError("planted")])
 def test_a_rebuild_loses_nothing(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     """One failure of the solver in the middle: a second later the estimate is that of the run without it, to cm."""
-    every, online = arrivals_of(run_of()), smoother(run_of())
+    every, (online, fed) = arrivals_of(run_of()), begun(10.0)
     n, base = at_s(every, 10.0), every[: at_s(every, 13.0)]
-    fed = feed(online, run_of(), base[:n])
     with monkeypatch.context() as patch:
         raised = broken_at(patch, Window, "commit", lambda k: k == 1, error)
         feed(online, run_of(), base[n : n + 30], fed)
@@ -686,9 +712,9 @@ def test_a_rebuild_loses_nothing(monkeypatch: pytest.MonkeyPatch, error: Excepti
 
 def test_a_solver_that_runs_away_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps from far off may lead farther, and the linear algebra does not mind: 10^20 m were once given out."""
-    every, online = arrivals_of(run_of()), smoother(run_of())
+    every, (online, fed) = arrivals_of(run_of()), begun(10.0)
     n, base = at_s(every, 10.0), every[: at_s(every, 13.0)]
-    fed, commit, lost = feed(online, run_of(), base[:n]), Window.commit, list[Window]()
+    commit, lost = Window.commit, list[Window]()
 
     def astray(window: Window) -> None:
         """The first window goes, whatever is solved again; another that is built anew does not."""
@@ -714,9 +740,8 @@ def test_exceptions_in_the_solver_are_survived(
     monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, share: float
 ) -> None:
     every, rng = arrivals_of(run_of()), np.random.default_rng(4)
-    online, base = smoother(run_of()), every[: at_s(every, 23.0)]
+    (online, fed), base = begun(6.0), every[: at_s(every, 23.0)]
     n = at_s(base, 6.0)
-    fed = feed(online, run_of(), base[:n])
     with monkeypatch.context() as patch:
         errors = [RuntimeError("planted"), MemoryError(), ValueError("planted")]
         raised = broken_at(patch, owner, name, lambda _: bool(rng.random() < share), errors[int(rng.integers(3))])
