@@ -12,7 +12,6 @@ import copyreg
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 from unittest.mock import patch
 
@@ -122,14 +121,21 @@ def feed(smoother: OnlineSmoother, run: SimulatedRun, arrivals: Sequence[Arrival
     return fed
 
 
-# How the objects of GTSAM are copied: those that change by their constructors; all others are made once, and shared, as measurements are.
-_CHANGE = (gtsam.ISAM2, gtsam.Values, gtsam.NonlinearFactorGraph)
+def _itself(x: Any) -> tuple[Any, ...]:
+    return (lambda: x), ()
+
+
+def _anew(x: Any) -> tuple[Any, ...]:
+    return (lambda: x.__class__(x)), ()
+
+
+# How GTSAM's objects are copied: those that change by their constructors; all others are made once, and shared, as measurements are.
 _KINDS = {
     kind for of in (gtsam, gtsam.noiseModel, gtsam.imuBias) for kind in vars(of).values() if inspect.isclass(kind)
 }
 _COPIERS: dict[type, Callable[[Any], Any]] = {
-    **dict.fromkeys({*_KINDS, ImuSample, GnssPosition, CompassHeading, PoseFix}, lambda x: (lambda: x, ())),
-    **dict.fromkeys(_CHANGE, lambda x: (partial(type(x), x), ())),
+    **dict.fromkeys({*_KINDS, ImuSample, GnssPosition, CompassHeading, PoseFix}, _itself),
+    **dict.fromkeys((gtsam.ISAM2, gtsam.Values, gtsam.NonlinearFactorGraph), _anew),
 }
 
 

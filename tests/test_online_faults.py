@@ -462,6 +462,7 @@ def test_a_receiver_alone_that_jumps_is_not_followed() -> None:
     assert fed.recovered_s(end) < 5.0
 
 
+@cache
 def jumping(
     hz: float, sigma_m: float, slow_m: float, jump_m: float, begin_s: float, lasts_s: float = 9.0
 ) -> tuple[SimulatedRun, Arrivals, int, int]:
@@ -501,12 +502,15 @@ def test_a_receiver_alone_whose_jump_the_imu_shows(
     hz: float, sigma_m: float, slow_m: float, jump_m: float, begin_s: float, bound_m: float
 ) -> None:
     """It is followed at neither end."""
-    run, jumped, _, _ = jumping(hz, sigma_m, slow_m, jump_m, begin_s)
-    fed = finish(online := smoother(run), feed(online, run, jumped))
+    case = (hz, sigma_m, slow_m, jump_m, begin_s)
+    run, jumped, _, _ = jumping(*case)
+    online, fed, n = begun_alone(jumping, case, 0.6)
+    finish(online, feed(online, run, jumped[n:], fed))
     assert len([e for e in fed.events if "position jump" in e and "rebuilt" in e]) == 2
     assert max(fed.errors_m) < bound_m
 
 
+@cache
 def hung(hz: float, lasts_s: float) -> tuple[SimulatedRun, Arrivals, int, int]:
     """As `jumping`, but the receiver repeats one fix instead."""
     run, base, begin, end = jumping(hz, 0.45, 2.0, 0.0, 9.1, lasts_s)
@@ -518,11 +522,25 @@ def hung(hz: float, lasts_s: float) -> tuple[SimulatedRun, Arrivals, int, int]:
     return run, repeated, begin, end
 
 
+@cache
+def _begun_alone(of: Callable[..., Any], case: tuple[float, ...], after_s: float) -> tuple[OnlineSmoother, Fed, int]:
+    run, arrivals, begin, _ = of(*case)
+    online, n = smoother(run), next(k for k, a in enumerate(arrivals) if a.true_ns > begin + after_s * 1e9)
+    return online, feed(online, run, arrivals[:n]), n
+
+
+def begun_alone(of: Callable[..., Any], case: tuple[float, ...], after_s: float) -> tuple[OnlineSmoother, Fed, int]:
+    """As `begun`, of such a run until some time after the jump begins, or the fix is repeated; and how many messages that are."""
+    online, fed, n = _begun_alone(of, case, after_s)
+    return copied(online), fed.copied(), n
+
+
 @pytest.mark.parametrize("hz", [1.0, 5.0])
 def test_a_receiver_alone_that_repeats_a_fix_is_not_followed_nor_where_it_goes_on(hz: float) -> None:
     """It was followed for 33 m, and its going on then taken for a jump: 62 m off."""
     run, repeated, begin, end = hung(hz, 12.0)
-    fed = finish(online := smoother(run), feed(online, run, repeated))
+    online, fed, n = begun_alone(hung, (hz, 12.0), 5.0)
+    finish(online, feed(online, run, repeated[n:], fed))
     off_m, t_s = np.array(fed.errors_m), (np.array(fed.true_ns) - begin) * 1e-9
     sigma_m = np.sqrt([np.trace(e.cov[:2, :2]) for e in fed.estimates])
     assert (off_m < 2.5 * sigma_m).all()
@@ -560,8 +578,8 @@ def test_fixes_that_turn_out_to_have_been_repeated_are_taken_out(monkeypatch: py
 def test_a_window_that_is_rebuilt_holds_repeated_fixes_out(after_s: float) -> None:
     """Also where it begins among them, and has none from before."""
     run, repeated, begin, _ = hung(5.0, 12.0)
-    online = smoother(run)
-    feed(online, run, repeated[: next(k for k, a in enumerate(repeated) if a.true_ns > begin + after_s * 1e9)])
+    online, _, n = begun_alone(hung, (5.0, 12.0), 5.0)
+    feed(online, run, [a for a in repeated[n:] if a.true_ns <= begin + after_s * 1e9])
     online._rebuild("planted")  # noqa: SLF001
     assert online._tracking is not None  # noqa: SLF001
     lag = online._tracking.lag  # noqa: SLF001
@@ -573,8 +591,7 @@ def test_a_window_that_is_rebuilt_holds_repeated_fixes_out(after_s: float) -> No
 def test_an_estimate_that_restarts_takes_a_receiver_that_repeats_a_fix_as_it_is() -> None:
     """That it moved said the estimate that was given up; while it is at rest, and the receiver holds its position, nothing would tell."""
     run, repeated, begin, end = hung(5.0, 12.0)
-    online = smoother(run)
-    feed(online, run, repeated[: next(k for k, a in enumerate(repeated) if a.true_ns > begin + 5_000_000_000)])
+    online, _, _ = begun_alone(hung, (5.0, 12.0), 5.0)
     assert online._tracking is not None  # noqa: SLF001
     assert online._tracking.lag.frozen_receivers == {"gnss"}  # noqa: SLF001
     online._restart("planted")  # noqa: SLF001
@@ -598,9 +615,9 @@ def test_a_jump_is_found_among_many_fixes_to_a_state() -> None:
 
 def test_a_window_that_is_rebuilt_amid_a_suspicion_has_the_fixes_before_it() -> None:
     """Where it turns out to be a burst of outliers, they come in no second time."""
-    run, jumped, begin, end = jumping(5.0, 0.45, 2.0, 7.0, 9.1)
-    online, now = smoother(run), next(k for k, a in enumerate(jumped) if a.true_ns > begin + 600_000_000)
-    fed = feed(online, run, jumped[:now])
+    case = (5.0, 0.45, 2.0, 7.0, 9.1)
+    run, jumped, begin, end = jumping(*case)
+    online, fed, now = begun_alone(jumping, case, 0.6)
     assert online._tracking is not None  # noqa: SLF001
     assert online._tracking.lag.problem.streams["gnss"].receiver.jump.suspects(online._tracking.lag.newest.stamp_ns)  # noqa: SLF001
     online._rebuild("planted")  # noqa: SLF001
@@ -631,10 +648,10 @@ def test_fixes_of_a_receiver_that_is_said_not_to_jump_are_used_after_a_jump() ->
 
 def test_no_window_begins_where_a_jump_was_not_known_yet() -> None:
     """Estimates from between a jump and its detection have the slow error of before it: a rebuild 9 s later was 8 m off."""
-    run, jumped, begin, _ = jumping(5.0, 0.45, 2.0, 7.0, 9.1)
-    online = smoother(run)
-    n = next(k for k, a in enumerate(jumped) if a.true_ns > begin + 1_800_000_000)
-    fed = feed(online, run, jumped[:n])
+    case = (5.0, 0.45, 2.0, 7.0, 9.1)
+    run, jumped, begin, _ = jumping(*case)
+    online, fed, n = begun_alone(jumping, case, 0.6)
+    feed(online, run, [a for a in jumped[n:] if a.true_ns <= begin + 1_800_000_000], fed)
     assert [e for e in fed.events if "position jump" in e and "rebuilt" in e]
     assert online._tracking is not None  # noqa: SLF001
     stamps_ns = [anchor.stamp_ns for anchor in online._tracking._recent.anchors]  # noqa: SLF001
