@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +27,8 @@ from graphloc.frontends._streams import Sentences, TopicData, read_streams
 from graphloc.frontends._tf import Pose, StaticTree
 from graphloc.frontends.aerial.cloud import CLOUDS
 from graphloc.frontends.decode import IMU, UNSTAMPED, header_stamp_ns
-from graphloc.frontends.source import Bag, TopicSummary
+from graphloc.frontends.part import Bags
+from graphloc.frontends.source import Bag, TopicSummary, unopened
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import IMAGES, INFO
 from graphloc.signals.pauses import common_pauses, pauses_warning
@@ -78,16 +78,16 @@ class Contents:
         return None if self.tf_pose(stream) is None else stream.frame_id
 
 
-def contents_of(paths: Path | str | Sequence[Path | str]) -> Contents:
-    """Read a whole bag: its topics, streams, transforms, and the first messages of LiDARs and cameras.
+def contents_of(bags: Bags | Bag) -> Contents:
+    """Read a bag: its topics, streams, transforms, and the first messages of LiDARs and cameras.
 
     Args:
-        paths: as for `read_recording`.
+        bags: as for `read_recording`.
 
     Raises:
         InputError: the bag cannot be opened, or its parts overlap in time.
     """
-    with Bag(paths) as bag:
+    with unopened(bags) as bag:
         topics = bag.topics
         bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
         streams, tree, sentences = read_streams(bag)

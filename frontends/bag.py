@@ -60,7 +60,7 @@ from graphloc.frontends.decode import (
     supported_types,
 )
 from graphloc.frontends.part import Bags
-from graphloc.frontends.source import Bag, TopicSummary
+from graphloc.frontends.source import Bag, TopicSummary, unopened
 from graphloc.frontends.vendors import VENDORS
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, ImuSeries, Measurement, PoseFix
@@ -80,11 +80,12 @@ def check_bag(bags: Bags, config: VesselConfig) -> None:
         _asked_for(config, bag)
 
 
-def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None = None) -> Recording:
+def read_recording(bags: Bags | Bag, config: VesselConfig, progress: Progress | None = None) -> Recording:
     """Read the topics that the configuration names.
 
     Args:
-        bags: a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, several files of a split bag, or a part of them.
+        bags: a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, several files of a split bag, a part of them, or a bag that is
+            not opened yet.
         config: topics, units and mounts of the sensors.
         progress: is called now and then with the stage, messages done and messages in all.
 
@@ -96,7 +97,7 @@ def read_recording(bags: Bags, config: VesselConfig, progress: Progress | None =
         InputError: no readable bag, a missing topic or one of another type, a mount without a chain of transforms, or an empty
             part of the bag.
     """
-    with Bag(bags) as bag:
+    with unopened(bags) as bag:
         topics = bag.topics
         sensors, truth, check = _asked_for(config, bag)
         span = _span(bag, config)

@@ -8,7 +8,6 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -71,6 +70,8 @@ from graphloc.frontends.decode import (
     TWIST,
     VECTOR,
 )
+from graphloc.frontends.part import Bags
+from graphloc.frontends.source import Bag
 from graphloc.frontends.time_offsets import MotionOffset, heading_time_offset, later_than, motion_time_offset
 from graphloc.frontends.turning import Turning
 from graphloc.measurements import CompassHeading
@@ -119,18 +120,18 @@ class _Track(NamedTuple):
     first: Vec | None
 
 
-def inspect_bag(paths: Path | str | Sequence[Path | str]) -> Inspection:
-    """Inspect a whole bag.
+def inspect_bag(bags: Bags | Bag) -> Inspection:
+    """Inspect a bag.
 
     Receivers come first, since the other sensors are judged by the track of the best one.
 
     Args:
-        paths: as for `read_recording`.
+        bags: as for `read_recording`.
 
     Raises:
         InputError: the bag cannot be opened, or its parts overlap in time.
     """
-    bag = contents_of(paths)
+    bag = contents_of(bags)
     tree, body = bag.tree, bag.tree.body()
     gnss = _gnss_reports(bag)
     reference = _best_track(bag, gnss)

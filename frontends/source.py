@@ -228,5 +228,10 @@ class Bag:
         return self._types.decode(message.data, message.msgtype)
 
 
+def unopened(bags: Bags | Bag) -> Bag:
+    """Return the recording at some paths, or itself, not opened yet."""
+    return bags if isinstance(bags, Bag) else Bag(bags)
+
+
 def _whole(paths: Path | str | Sequence[Path | str]) -> BagPart:
     return BagPart((Path(paths),) if isinstance(paths, str | Path) else tuple(Path(p) for p in paths))

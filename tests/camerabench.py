@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,9 @@ CORNERS = np.array([(-HALF, HALF, 0.0), (HALF, HALF, 0.0), (HALF, -HALF, 0.0), (
 LOOKING_AHEAD = MountConfig(rpy_deg=(-90.0, 0.0, -90.0))
 
 
-def docking(condition: str, seed: int = 1, **changes: Any) -> tuple[SimulatedRun, Camera]:
-    kind = changes.pop("kind", "fixed")
-    run = simulate(replace(harbour_scenarios()[f"dock-{kind}-{condition}"], **changes), seed)
+@cache
+def docking(condition: str, kind: str = "fixed") -> tuple[SimulatedRun, Camera]:
+    run = simulate(harbour_scenarios()[f"dock-{kind}-{condition}"], 1)
     (name,) = run.rig.cameras
     return run, Camera(name, scene_of(run), run)
 
@@ -56,6 +57,12 @@ def seen_from(p: Array, R: Array, K: Array) -> Array:
     return np.asarray(flat[:, :2] / flat[:, 2:])
 
 
+@cache
+def _underway(condition: str) -> SimulatedRun:
+    still = {"camera_hz": "1", "tide_m": "0", "condition": condition, "duration_s": "4"}
+    return simulate(find_scenario("bl3-clean", still), 1)
+
+
 @contextmanager
 def bench(
     tag: dict[str, Any], camera: RigCamera | None = None, condition: str = "optimal", **more: Any
@@ -69,7 +76,7 @@ def bench(
         },
         "bench",
     )  # fmt: skip
-    run = simulate(find_scenario("bl3-clean", {"camera_hz": "1", "tide_m": "0", "condition": condition}), 1)
+    run = _underway(condition)
     block = ((-3.0, -1.0), (-2.0, -1.0), (-2.0, 1.0), (-3.0, 1.0))  # the vessel: behind the camera
     hull = HullConfig(outline=block, top_m=0.5, cabin=block, cabin_top_m=1.0)
     rig = RigConfig(

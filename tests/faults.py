@@ -7,10 +7,15 @@ when it is over. Benchmarks inject a thousand of them.
 
 from __future__ import annotations
 
+import copy
+import copyreg
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
+from unittest.mock import patch
 
+import gtsam
 import numpy as np
 
 from graphloc.estimate import Estimate
@@ -64,9 +69,9 @@ def delayed(
     return [arrivals[i] for i in np.argsort(late, kind="stable")]
 
 
-def numbered(arrivals: Arrivals) -> Arrivals:
+def numbered(arrivals: Arrivals, first: int = 0) -> Arrivals:
     """Arrival numbers anew: a fault may have doubled messages."""
-    return [replace(a, m=replace(a.m, seq=n)) for n, a in enumerate(arrivals)]
+    return [replace(a, m=replace(a.m, seq=n)) for n, a in enumerate(arrivals, first)]
 
 
 @dataclass(slots=True)
@@ -83,6 +88,10 @@ class Fed:
     true_ns: list[int] = field(default_factory=list)
     rows: list[LedgerRow] = field(default_factory=list)
     events: list[str] = field(default_factory=list)
+
+    def copied(self) -> Fed:
+        """Return what came until now, to which more can be added."""
+        return replace(self, **{name: list(getattr(self, name)) for name in self.__slots__})
 
     def recovered_s(self, since_ns: int, within_m: float = 3.0) -> float:
         """Time from `since_ns` until there are estimates again and their error is, and stays, small; inf: never."""
@@ -110,6 +119,30 @@ def feed(smoother: OnlineSmoother, run: SimulatedRun, arrivals: Sequence[Arrival
         off_m = np.array([e.p_world_m for e in fed.estimates[begin:]]) - true_m
         fed.errors_m += np.hypot(off_m[:, 0], off_m[:, 1]).tolist()
     return fed
+
+
+def _itself(x: Any) -> tuple[Any, ...]:
+    return (lambda: x), ()
+
+
+def _anew(x: Any) -> tuple[Any, ...]:
+    return (lambda: x.__class__(x)), ()
+
+
+# How GTSAM's objects are copied: those that change by their constructors; all others are made once, and shared, as measurements are.
+_KINDS = {
+    kind for of in (gtsam, gtsam.noiseModel, gtsam.imuBias) for kind in vars(of).values() if inspect.isclass(kind)
+}
+_COPIERS: dict[type, Callable[[Any], Any]] = {
+    **dict.fromkeys({*_KINDS, ImuSample, GnssPosition, CompassHeading, PoseFix}, _itself),
+    **dict.fromkeys((gtsam.ISAM2, gtsam.Values, gtsam.NonlinearFactorGraph), _anew),
+}
+
+
+def copied(online: OnlineSmoother) -> OnlineSmoother:
+    """Return a smoother that goes on as this one would, apart from it."""
+    with patch.dict(copyreg.dispatch_table, _COPIERS):
+        return copy.deepcopy(online)
 
 
 def finish(smoother: OnlineSmoother, fed: Fed) -> Fed:

@@ -16,7 +16,6 @@ from graphloc.eval.calibrate._evidence import Evidence, OffsetEstimate
 from graphloc.eval.calibrate._imu import imu_noise
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
-from graphloc.frontends.bag import read_recording
 from graphloc.frontends.time_offsets import heading_time_offset
 from graphloc.frontends.turning import Turning
 from graphloc.measurements import GnssVelocity, ImuSeries
@@ -26,6 +25,7 @@ from graphloc.solve import smooth
 from graphloc.solve.imu_noise import imu_misfit
 from graphloc.solve.linearised import normal_solver
 from tests.bagfactory import Messages
+from tests.heldbags import read_recording
 from tests.slowly import simulate_slowly
 from tests.test_inspect import drive, look
 from tests.test_odd_vessels import antenna_velocity

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from graphloc.config import BodyVelocityConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import DECODERS
 from graphloc.ledger import Outcome
 from graphloc.measurements import BodyVelocity
-from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.bagfactory import START_NS, Item, Messages, S
+from tests.heldbags import hold_bag, read_recording
 from tests.makers import said
 from tests.test_inspect import drive, look
 
@@ -152,7 +152,7 @@ def test_two_sensors_read_one_topic_where_it_says_through_what(msgtype: str, tmp
     """Of the other types each message would count twice."""
     make = Messages(2)
     items = [("/dvl", at, said(make, msgtype, header=make.header(at), **fields(make, msgtype, through=mode))) for mode, at in ((1, START_NS), (2, START_NS + S))]  # fmt: skip
-    path = write_bag(tmp_path / "run", make, items, "mcap")
+    path = hold_bag(tmp_path / "run", make, items)
     sensors = {through: BodyVelocityConfig(topic="/dvl", through=through) for through in ("ground", "water")}
     config = VesselConfig(sensors=sensors)
     if msgtype in WATERLINKED:

@@ -14,15 +14,15 @@ from graphloc.eval.metrics import held_out_errors
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import SENSORS
 from graphloc.frames import Datum, Geodetic
-from graphloc.frontends.bag import read_recording
-from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.frontends.inspect import draft_config
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, PoseFix
 from graphloc.origin import choose_datum, height_m
 from graphloc.recording import Recording
 from graphloc.replay import replay
 from graphloc.trajectory import Trajectory
-from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.bagfactory import START_NS, Item, Messages, S
+from tests.heldbags import hold_bag, inspect_bag, read_recording
 from tests.slowly import simulate_slowly
 from tests.test_bag import KINDS
 from tests.test_bag_bad_input import accounted, rows_of, vessel
@@ -55,7 +55,7 @@ def fixes(
 
 
 def read(tmp_path: Path, items: list[Item], **gnss: object) -> Recording:
-    path = write_bag(tmp_path / "run", MAKE, items, "mcap")
+    path = hold_bag(tmp_path / "run", MAKE, items)
     recording = read_recording(path, vessel(imu=None, gnss={"topic": "/fix", **gnss}))
     assert recording.message_count == accounted(recording)
     return recording

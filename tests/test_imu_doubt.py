@@ -28,9 +28,9 @@ from graphloc.recording import Recording, quiet
 from graphloc.solution import Health, Solution
 from graphloc.solve import _first_solution, wrong_imu
 from graphloc.solve._start import Begun
-from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
+from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish
 from tests.slowly import slowly
-from tests.test_online_faults import at_s, run_of, smoother
+from tests.test_online_faults import at_s, begun, run_of
 
 S = 1_000_000_000
 Change = Callable[[Measurement], Measurement]
@@ -41,7 +41,7 @@ def changed(change: Change, from_s: float = 12.0, until_s: float = 16.0) -> Arri
     arrivals = arrivals_of(run_of())
     begin = arrivals[0].true_ns
     inside = [from_s <= (a.true_ns - begin) / S < until_s for a in arrivals]
-    return numbered([replace(a, m=change(a.m)) if n else a for a, n in zip(arrivals, inside, strict=True)])
+    return [replace(a, m=change(a.m)) if n else a for a, n in zip(arrivals, inside, strict=True)]
 
 
 def in_degrees(m: Measurement) -> Measurement:
@@ -69,8 +69,8 @@ def blamed(fed: Fed) -> int:
 @pytest.mark.parametrize("change", [in_degrees, axes_swapped, biased])
 def test_an_imu_that_goes_wrong_is_left_out_until_it_is_right_again(change: Change) -> None:
     arrivals = changed(change)
-    online = smoother(run_of())
-    fed = finish(online, feed(online, run_of(), arrivals))
+    online, fed = begun(12.0)
+    finish(online, feed(online, run_of(), arrivals[at_s(arrivals, 12.0) :], fed))
     assert complaints(arrivals, fed) == []
     assert blamed(fed) == 1
     assert fed.worst_m() < 4.0
@@ -107,8 +107,9 @@ def both_off(m: Measurement) -> Measurement:
 
 @pytest.mark.parametrize("change", [compass_off, compass_turns, fixes_off, both_off])
 def test_sensors_that_no_motion_explains_are_not_believed_against_the_imu(change: Change) -> None:
-    online = smoother(run_of())
-    fed = finish(online, feed(online, run_of(), changed(change)))
+    arrivals = changed(change)
+    online, fed = begun(12.0)
+    finish(online, feed(online, run_of(), arrivals[at_s(arrivals, 12.0) :], fed))
     assert blamed(fed) == 0
     assert not [r for r in fed.rows if r.sensor == "imu" and r.outcome is Outcome.REJECTED]
 
@@ -121,10 +122,9 @@ def test_it_is_left_out_only_where_a_motion_of_a_vessel_explains_the_denials(
 ) -> None:
     """No motion is quiet enough, or no share of what denied large enough: then the estimate of the IMU stands."""
     arrivals = changed(axes_swapped)
-    arrivals = arrivals[: at_s(arrivals, 15.5)]
     monkeypatch.setattr(where, guard, value)
-    online = smoother(run_of())
-    assert blamed(feed(online, run_of(), arrivals)) == 0
+    online, _ = begun(12.0)
+    assert blamed(feed(online, run_of(), arrivals[at_s(arrivals, 12.0) : at_s(arrivals, 15.5)])) == 0
 
 
 def smoothed(
@@ -213,11 +213,11 @@ def test_offline_it_is_not_blamed_for_others(change: Change) -> None:
 
 def test_a_trial_that_explains_nothing_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
     arrivals = changed(in_degrees)
-    arrivals = arrivals[: at_s(arrivals, 15.0)]
+    arrivals = arrivals[at_s(arrivals, 12.0) : at_s(arrivals, 15.0)]
 
     def estimates() -> Array:
-        online = smoother(run_of())
-        fed = finish(online, feed(online, run_of(), arrivals))
+        online, fed = begun(12.0)
+        finish(online, feed(online, run_of(), arrivals, fed))
         assert blamed(fed) == 0
         return np.array([e.p_world_m for e in fed.estimates])
 

@@ -12,19 +12,27 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.spatial.transform import Rotation
 
-from graphloc.config import BodyVelocityConfig, CompassConfig, GnssConfig, ImuConfig, VesselConfig, load_config
+from graphloc.config import (
+    BodyVelocityConfig,
+    CompassConfig,
+    GnssConfig,
+    ImuConfig,
+    VesselConfig,
+    load_config,
+    parse_config,
+)
 from graphloc.frames import Array, Datum, Geodetic, rotation_from_rpy_deg
 from graphloc.frontends._assess_velocity import EITHER, axes_of, velocity_report
 from graphloc.frontends._fixes import radians_warning
 from graphloc.frontends._reports import BODY_AXES, EAST_AXES
 from graphloc.frontends._streams import TopicData
-from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import TWIST
-from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, render
+from graphloc.frontends.inspect import Inspection, draft_config, render
 from graphloc.frontends.source import Bag, RawMessage
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.commands import called
+from tests.heldbags import hold_bag, inspect_bag, read_recording
 from tests.test_bag import HUSKY, KINDS
 
 DATUM = Datum(Geodetic(57.7, 11.9, 40.0))
@@ -88,7 +96,7 @@ def drive(
 
 def look(tmp_path: Path, items: list[Item], make: Messages) -> tuple[Inspection, VesselConfig, str]:
     """Inspect; the draft must load, and the text and the JSON must be made."""
-    path = write_bag(tmp_path / "run", make, items, "mcap")
+    path = hold_bag(tmp_path / "run", make, items)
     found = inspect_bag(path)
     text = draft_config(found)
     (tmp_path / "vessel.yaml").write_text(text)
@@ -96,6 +104,33 @@ def look(tmp_path: Path, items: list[Item], make: Messages) -> tuple[Inspection,
     assert render(found)
     json.loads(json.dumps(found.as_dict(), allow_nan=False))
     return found, config, text
+
+
+def test_a_bag_held_in_memory_says_what_its_file_says(tmp_path: Path) -> None:
+    """As the tests of `inspect` hold theirs."""
+    make = Messages(2)
+    mounts = [("base_link", "imu_link", (0.1, 0.0, 0.3), (0, 0, 0, 1))]
+    items = [("/tf_static", START_NS, make.transforms(mounts)), *drive(make)]
+    items += [("/note", at, make.text("hello")) for _, at, _ in items[::100]]
+    sensors = {"imu": {"kind": "imu", "topic": "/imu"}, "gnss": {"kind": "gnss", "topic": "/fix"}}
+    config = parse_config({"sensors": sensors}, KINDS, "test")
+    paths = (
+        write_bag(tmp_path / "a" / "run", make, items, "mcap"),
+        hold_bag(tmp_path / "b" / "run", make, sorted(items, key=lambda item: -item[1])),
+    )
+    file, held = (json.dumps(inspect_bag(path).as_dict()).replace(str(path), "") for path in paths)
+    assert file == held
+    read = [read_recording(path, config) for path in paths]
+    assert read[0].rows == read[1].rows
+    assert read[0].message_count == read[1].message_count
+    for a, b in zip(read[0].measurements, read[1].measurements, strict=True):
+        assert isinstance(a, GnssPosition)
+        assert isinstance(b, GnssPosition)
+        assert (a.stamp_ns, a.seq, a.position) == (b.stamp_ns, b.seq, b.position)
+        np.testing.assert_array_equal(a.cov_enu_m2, b.cov_enu_m2)
+    assert read[0].imu is not None
+    assert read[1].imu is not None
+    np.testing.assert_array_equal(read[0].imu.accel_mps2, read[1].imu.accel_mps2)
 
 
 def test_longitudes_that_are_none_are_no_places(tmp_path: Path) -> None:

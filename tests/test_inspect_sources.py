@@ -23,11 +23,11 @@ from graphloc.config import (
 )
 from graphloc.errors import InputError
 from graphloc.frames import Array
-from graphloc.frontends.bag import read_recording
-from graphloc.frontends.inspect import Inspection, draft_config, inspect_bag, render
+from graphloc.frontends.inspect import Inspection, draft_config, render
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition
-from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.bagfactory import START_NS, Item, Messages, S
+from tests.heldbags import hold_bag, inspect_bag, read_recording
 from tests.makers import said
 from tests.test_bag import KINDS
 from tests.test_inspect import DATUM, ROLL_90, G, drive, look, rotation_z
@@ -258,7 +258,7 @@ def test_antennas_in_a_tf_that_looks_down_are_drafted_above(
 def test_a_mount_that_the_fixes_deny_is_reported_when_a_bag_is_read(turned_deg: float, tmp_path: Path) -> None:
     """A compass that tells the right heading leaves the course right: nothing else was said, and the track was metres off."""
     make = Messages(2)
-    path = write_bag(tmp_path / "run", make, drive(make, rotation_z(90.0 + turned_deg), status=0, sigma_m=1.0))
+    path = hold_bag(tmp_path / "run", make, drive(make, rotation_z(90.0 + turned_deg), status=0, sigma_m=1.0))
     sensors = {
         "imu": {"kind": "imu", "topic": "/imu", "mount": {"rpy_deg": [0, 0, 90]}},
         "gnss": {"kind": "gnss", "topic": "/fix"},
@@ -661,7 +661,7 @@ def test_half_an_imu_is_not_taken_for_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("topic", "said"), [("accel", "all rates"), ("gyro", "all accelerations")])
 def test_half_an_imu_is_refused_when_a_bag_is_read(topic: str, said: str, tmp_path: Path) -> None:
     make = Messages(2)
-    path = write_bag(tmp_path / "run", make, halves(make))
+    path = hold_bag(tmp_path / "run", make, halves(make))
     sensors = {"imu": {"kind": "imu", "topic": f"/camera/{topic}/sample"}, "gnss": {"kind": "gnss", "topic": "/fix"}}
     with pytest.raises(InputError, match=f"{said} of /camera/{topic}/sample are 0"):
         read_recording(path, parse_config({"sensors": sensors}, KINDS, "test"))
@@ -781,7 +781,7 @@ def test_what_no_run_can_do_without_is_reported(scanned: bool, tmp_path: Path) -
         data=np.zeros(0, np.uint8), is_dense=True,
     )  # fmt: skip
     scans = [("/scans", items[-1][1], cloud)] if scanned else []
-    found = inspect_bag(write_bag(tmp_path / "run", make, [*items, *scans, ("/location", items[-1][1], place)]))
+    found = inspect_bag(hold_bag(tmp_path / "run", make, [*items, *scans, ("/location", items[-1][1], place)]))
     said = " | ".join(found.warnings)
     assert "nothing in it tells the place" in said
     assert "smooth, replay and compare need one: record it, too" in said
@@ -1094,7 +1094,7 @@ def cloud(make: Messages, stamp_ns: int, frame: str) -> Any:
 
 def aerial_of(tmp_path: Path, items: list[Item], make: Messages) -> tuple[Inspection, str, AerialConfig]:
     """Inspection, draft, and its aerial block."""
-    found = inspect_bag(write_bag(tmp_path / "run", make, sorted(items, key=lambda item: item[1]), "mcap"))
+    found = inspect_bag(hold_bag(tmp_path / "run", make, sorted(items, key=lambda item: item[1])))
     text = draft_config(found)
     (tmp_path / "vessel.yaml").write_text(text)
     aerial = load_config(tmp_path / "vessel.yaml", factors.KINDS).sensors["aerial"]

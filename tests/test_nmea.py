@@ -32,12 +32,12 @@ from graphloc.frontends._contents import contents_of
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._types import OTHER_TYPES
-from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import DECODERS, TWIST
-from graphloc.frontends.inspect import draft_config, inspect_bag, render
+from graphloc.frontends.inspect import draft_config, render
 from graphloc.ledger import Outcome
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, PoseFix
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.heldbags import hold_bag, inspect_bag, read_recording
 from tests.test_inspect import DATUM, drive, look
 
 SENTENCE = "nmea_msgs/msg/Sentence"
@@ -250,7 +250,7 @@ def test_lines_in_plain_strings_count_from_when_they_were_recorded(tmp_path: Pat
             ("/line", begin_ns + k * S, make.text(burst)),
             ("/status", begin_ns + k * S, make.text("under way")),
         ]
-    bag, drafted = write_bag(tmp_path / "run", make, items), tmp_path / "vessel.yaml"
+    bag, drafted = hold_bag(tmp_path / "run", make, items), tmp_path / "vessel.yaml"
     drafted.write_text(draft_config(inspect_bag(bag)))
     config = load_config(drafted, KINDS)
     lines = {(s.topic, s.nmea) for s in config.sensors.values() if isinstance(s, GnssConfig | CompassConfig)}
@@ -277,7 +277,7 @@ def rmc_bag(path: Path, more: Callable[[float, float], list[str]], speeds: bool 
         place = f"{minutes(lat, 'NS', 2)},{minutes(lon, 'EW', 3)}"
         bodies = [f"GPRMC,120000.00,A,{place},{said},141123,,,A", *more(knots, course)]
         items += [("/line", 1_700_000_000 * S + k * S // 5, make.text(sealed(body))) for body in bodies]
-    return write_bag(path, make, items)
+    return hold_bag(path, make, items)
 
 
 @pytest.mark.parametrize(
@@ -319,7 +319,7 @@ def gga_bag(path: Path, quality: Callable[[int], int], damaged: int = 0) -> Path
         line = sealed(f"GNGGA,120000.00,{place},{quality(k)},14,0.7,41.5,M,36.5,M,1.0,0001")
         line = line[:-2] + f"{int(line[-2:], 16) ^ 1:02X}" if k < damaged else line
         items.append(("/line", 1_700_000_000 * S + k * S // 5, make.text(line)))
-    return write_bag(path, make, items)
+    return hold_bag(path, make, items)
 
 
 @pytest.mark.parametrize(
@@ -354,7 +354,7 @@ def lines_bag(path: Path, bodies: Callable[[int], list[str]], count: int, step_n
     items = [
         ("/line", 1_700_000_000 * S + k * step_ns, make.text(sealed(body))) for k in range(count) for body in bodies(k)
     ]
-    return write_bag(path, make, items)
+    return hold_bag(path, make, items)
 
 
 def ahead(k: int, mps: float = 5.0) -> str:
@@ -370,7 +370,7 @@ def test_a_line_that_is_read_is_not_said_to_be_of_no_known_type(tmp_path: Path) 
         at = 1_700_000_000 * S + k * S
         said = make.t[SENTENCE](header=make.header(at), sentence=sealed(f"GPGLL,{ahead(k)},120000,A,A"))
         items.append(("/nmea", at, said))
-    warnings = inspect_bag(write_bag(tmp_path / "run", make, items)).warnings
+    warnings = inspect_bag(hold_bag(tmp_path / "run", make, items)).warnings
     assert any("no whole IMU" in w for w in warnings)
     assert not any("/nmea" in w for w in warnings)
 
@@ -457,7 +457,7 @@ def test_two_receivers_on_a_line_stay_two(every: int, apart_ns: int, tmp_path: P
         items.append(("/line", at, make.text(sealed("GN" + gga))))
         if k % every == 0:
             items.append(("/line", at + apart_ns, make.text(sealed("GP" + gga))))
-    seen = inspect_bag(write_bag(tmp_path / "run", make, items))
+    seen = inspect_bag(hold_bag(tmp_path / "run", make, items))
     assert [g.topic for g in seen.gnss] == ["/line GNGGA", "/line GPGGA"]
 
 
@@ -492,7 +492,7 @@ def test_two_receivers_that_are_recorded_to_the_second_stay_two(tmp_path: Path) 
     make, items = Messages(2), list[Item]()
     for k in range(200):
         items += [("/line", 1_700_000_000 * S + k // 5 * S, make.text(sealed(body))) for body in bodies(k)]
-    seen = inspect_bag(write_bag(tmp_path / "run", make, items))
+    seen = inspect_bag(hold_bag(tmp_path / "run", make, items))
     assert [g.topic for g in seen.gnss] == ["/line GNGGA", "/line GPGGA"]
 
 
@@ -586,7 +586,7 @@ def test_messages_of_other_packages_say_the_same(tmp_path: Path) -> None:
             ("/vel", stamp, make.t["geometry_msgs/msg/Vector3Stamped"](header=make.header(stamp), vector=make.vector((3.0, 0.0, 0.0)))),
             ("/pose", stamp, make.t["geometry_msgs/msg/PoseStamped"](header=make.header(stamp), pose=make.pose(stamp, (3.0 * k, 1.0, 0.0)).pose.pose)),
         ]  # fmt: skip
-    path = write_bag(tmp_path / "run", make, items)
+    path = hold_bag(tmp_path / "run", make, items)
     config = tmp_path / "vessel.yaml"
     config.write_text(
         "vessel: other\ndatum: {latitude_deg: 57.7, longitude_deg: 11.9, height_m: 40.0}\nsensors:\n  gnss: {kind: gnss, topic: /gps, min_status: sbas}\n"

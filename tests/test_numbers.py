@@ -11,10 +11,11 @@ from graphloc.config import load_config
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.frontends.inspect import draft_config
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition
 from tests.bagfactory import Item, Messages, write_bag
+from tests.heldbags import hold_bag, inspect_bag
 from tests.test_bag_bad_input import accounted
 
 DOUBLE, SINGLE = "std_msgs/msg/Float64", "std_msgs/msg/Float32"
@@ -108,7 +109,7 @@ def drafted(tmp_path: Path, run: SimulatedRun, late_ns: int, unknown: float) -> 
         (YAW, m.stamp_ns + late_ns, make.t[DOUBLE](data=unknown if k < 10 else m.yaw_rad))
         for k, m in enumerate(headings)
     ]
-    return draft_config(inspect_bag(write_bag(tmp_path / "run", make, sorted(items, key=lambda i: i[1]))))
+    return draft_config(inspect_bag(hold_bag(tmp_path / "run", make, sorted(items, key=lambda i: i[1]))))
 
 
 def test_what_says_that_it_does_not_know_is_no_unit(run: SimulatedRun, tmp_path: Path) -> None:

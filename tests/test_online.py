@@ -24,7 +24,7 @@ from graphloc.online import OnlineSmoother, _start, _waiting
 from graphloc.signals.thinning import THINNED
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
-from tests.faults import Arrival, Arrivals, Fed, arrivals_of, complaints, delayed, feed, finish
+from tests.faults import Arrival, Arrivals, Fed, arrivals_of, complaints, copied, delayed, feed, finish
 from tests.slowly import slowly
 from tests.tagfactory import sighted
 
@@ -209,11 +209,13 @@ def test_a_prediction_knows_imu_samples_that_came_late() -> None:
     late = [
         a for a in arrivals if isinstance(a.m, ImuSample) and end_ns - 700_000_000 < a.true_ns < end_ns - 350_000_000
     ]
-    ends = []
-    for some in (arrivals, [*(a for a in arrivals if a not in late), *late]):
-        online = smoother(run)
-        feed(online, run, some)
-        ends.append(online.predict(arrivals[-1].true_ns))
+    before = next(n for n, a in enumerate(arrivals) if a in late)
+    online, ends = smoother(run), []
+    feed(online, run, arrivals[:before])
+    rest = arrivals[before:]
+    for one, some in ((copied(online), rest), (online, [*(a for a in rest if a not in late), *late])):
+        feed(one, run, some)
+        ends.append(one.predict(arrivals[-1].true_ns))
     in_time, too_late = ends
     assert in_time is not None
     assert too_late is not None
@@ -228,10 +230,14 @@ def test_an_imu_step_is_reintegrated_when_its_samples_come_late() -> None:
     hole = [a for a in arrivals if isinstance(a.m, ImuSample) and begin <= a.true_ns < begin + 300_000_000]
     rest = [a for a in arrivals if a not in hole]
     after = next(n for n, a in enumerate(rest) if a.true_ns > begin + 1_800_000_000)
-    _, lag = whole(drift(), [*rest[:after], *hole, *rest[after:]])
-    assert apart_m(lag, in_order()[1]).max() < 0.01
-    _, holed = whole(drift(), rest)
-    assert apart_m(holed, in_order()[1]).max() > 0.02  # else this shows nothing
+    online = smoother(drift())
+    feed(online, drift(), rest[:after])
+    left = copied(online)
+    for one, some, lowest_m, highest_m in ((online, hole, 0.0, 0.01), (left, [], 0.02, 1.0)):  # else this shows nothing
+        feed(one, drift(), [*some, *rest[after:]])
+        lag = one.window()
+        assert lag is not None
+        assert lowest_m <= apart_m(lag, in_order()[1]).max() < highest_m
 
 
 def test_the_way_to_a_measurement_is_reintegrated_when_samples_come_late() -> None:

@@ -31,7 +31,7 @@ from graphloc.online._setup import Setup
 from graphloc.online._window import Window
 from graphloc.solution import Health
 from graphloc.time import stamps_of
-from tests.faults import FAULTS, Arrival, Arrivals, Fed, arrivals_of, complaints, feed, finish, numbered
+from tests.faults import FAULTS, Arrival, Arrivals, Fed, arrivals_of, complaints, copied, feed, finish, numbered
 from tests.slowly import slowly
 
 RATE_HZ = 2.5  # of states
@@ -66,6 +66,18 @@ def whole(arrivals: Arrivals, online: OnlineSmoother | None = None) -> Fed:
     return finish(online, feed(online, run_of(), arrivals))
 
 
+@cache
+def _begun(t_s: float) -> tuple[OnlineSmoother, Fed]:
+    online, arrivals = smoother(run_of()), arrivals_of(run_of())
+    return online, feed(online, run_of(), arrivals[: at_s(arrivals, t_s)])
+
+
+def begun(t_s: float) -> tuple[OnlineSmoother, Fed]:
+    """A smoother that was fed the first seconds of the run, and what came of it: most of the time is the start's."""
+    online, fed = _begun(t_s)
+    return copied(online), fed.copied()
+
+
 def at_s(arrivals: Arrivals, t_s: float) -> int:
     """Index of the first arrival from a time on."""
     return next(n for n, a in enumerate(arrivals) if a.true_ns >= arrivals[0].true_ns + t_s * 1e9)
@@ -74,10 +86,25 @@ def at_s(arrivals: Arrivals, t_s: float) -> int:
 @cache
 def after_12_s() -> Lag:
     """The window after 12 s of the run; not to be changed."""
-    online, arrivals = smoother(run_of()), arrivals_of(run_of())
-    feed(online, run_of(), arrivals[: at_s(arrivals, 12.0)])
+    online, _ = begun(12.0)
     assert online._tracking is not None  # noqa: SLF001
     return online._tracking.lag  # noqa: SLF001
+
+
+def test_a_copy_goes_on_as_the_smoother_itself() -> None:
+    """So that tests can share a beginning: to the last bit, and neither changes the other."""
+    base, n = arrivals_of(run_of())[:], at_s(arrivals_of(run_of()), 10.0)
+    first, fed = begun(10.0)
+    finish(first, feed(first, run_of(), base[n:], fed))
+    second, again = begun(10.0)
+    finish(second, feed(second, run_of(), base[n:], again))
+    for one in (fed, again):
+        assert one.rows == undisturbed().rows
+        assert one.events == undisturbed().events
+        for a, b in zip(one.estimates, undisturbed().estimates, strict=True):
+            assert a.stamp_ns == b.stamp_ns
+            for name in ("p_world_m", "R_world_body", "cov", "p_odom_m"):
+                assert np.array_equal(getattr(a, name), getattr(b, name))
 
 
 QUICK = ["backward stamps", "jumping stamps", "zero stamps", "repeated", "clock back", "latitude and longitude swapped",
@@ -90,8 +117,11 @@ def test_a_fault_is_survived(name: str) -> None:
     base = arrivals_of(run_of())
     begin = base[0].true_ns + 9_000_000_000
     broken, until = FAULTS[name](base, begin, np.random.default_rng(5))
-    arrivals = numbered([a for a in broken if a.true_ns < until + 8_000_000_000])
-    fed = whole(arrivals)
+    n, (online, fed) = at_s(base, 9.0), begun(9.0)
+    assert [a.m.stamp_ns for a in broken[:n]] == [a.m.stamp_ns for a in base[:n]]
+    rest = numbered([a for a in broken[n:] if a.true_ns < until + 8_000_000_000], len(base))
+    finish(online, feed(online, run_of(), rest, fed))
+    arrivals = [*base[:n], *rest]
     assert complaints(arrivals, fed) == []
     # A clock that jumps costs a new start: 5 s of IMU data, and up to half a second until it is tried.
     assert fed.recovered_s(until) < 6.0
@@ -150,8 +180,7 @@ def test_a_start_that_fails_keeps_the_ledger_complete(monkeypatch: pytest.Monkey
 @pytest.mark.parametrize("kept", [True, False])
 def test_agreement_with_a_rejected_choice_does_not_count(kept: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """It put off the new start of an estimate 35 m aside by a minute: the right matches agreed, but only while they were tried."""
-    base, online = arrivals_of(run_of()), smoother(run_of())
-    feed(online, run_of(), base[: at_s(base, 12.0)])
+    online, _ = begun(12.0)
     assert online._tracking is not None  # noqa: SLF001
     judge, agreement = online._tracking.lag._judge, online._tracking.lag._agreement  # noqa: SLF001
     stream = online._tracking.lag.problem.streams["matcher"]  # noqa: SLF001
@@ -366,9 +395,8 @@ def test_a_measurement_let_in_by_a_wide_kernel_agrees_only_when_judged_again(
     widened: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A fix 300 m off, let in once a second as the prediction was unsure, put off the new start of a lost estimate."""
-    base, online = arrivals_of(run_of()), smoother(run_of())
+    base, (online, _) = arrivals_of(run_of()), begun(12.0)
     now, soon, later = (at_s(base, t_s) for t_s in (12.0, 12.8, 14.5))
-    feed(online, run_of(), base[:now])
     assert online._tracking is not None  # noqa: SLF001
     judge, agreement = online._tracking.lag._judge, online._tracking.lag._agreement  # noqa: SLF001
     by_kernel = judge._by_kernel  # noqa: SLF001
@@ -434,6 +462,7 @@ def test_a_receiver_alone_that_jumps_is_not_followed() -> None:
     assert fed.recovered_s(end) < 5.0
 
 
+@cache
 def jumping(
     hz: float, sigma_m: float, slow_m: float, jump_m: float, begin_s: float, lasts_s: float = 9.0
 ) -> tuple[SimulatedRun, Arrivals, int, int]:
@@ -473,12 +502,15 @@ def test_a_receiver_alone_whose_jump_the_imu_shows(
     hz: float, sigma_m: float, slow_m: float, jump_m: float, begin_s: float, bound_m: float
 ) -> None:
     """It is followed at neither end."""
-    run, jumped, _, _ = jumping(hz, sigma_m, slow_m, jump_m, begin_s)
-    fed = finish(online := smoother(run), feed(online, run, jumped))
+    case = (hz, sigma_m, slow_m, jump_m, begin_s)
+    run, jumped, _, _ = jumping(*case)
+    online, fed, n = begun_alone(jumping, case, 0.6)
+    finish(online, feed(online, run, jumped[n:], fed))
     assert len([e for e in fed.events if "position jump" in e and "rebuilt" in e]) == 2
     assert max(fed.errors_m) < bound_m
 
 
+@cache
 def hung(hz: float, lasts_s: float) -> tuple[SimulatedRun, Arrivals, int, int]:
     """As `jumping`, but the receiver repeats one fix instead."""
     run, base, begin, end = jumping(hz, 0.45, 2.0, 0.0, 9.1, lasts_s)
@@ -490,11 +522,25 @@ def hung(hz: float, lasts_s: float) -> tuple[SimulatedRun, Arrivals, int, int]:
     return run, repeated, begin, end
 
 
+@cache
+def _begun_alone(of: Callable[..., Any], case: tuple[float, ...], after_s: float) -> tuple[OnlineSmoother, Fed, int]:
+    run, arrivals, begin, _ = of(*case)
+    online, n = smoother(run), next(k for k, a in enumerate(arrivals) if a.true_ns > begin + after_s * 1e9)
+    return online, feed(online, run, arrivals[:n]), n
+
+
+def begun_alone(of: Callable[..., Any], case: tuple[float, ...], after_s: float) -> tuple[OnlineSmoother, Fed, int]:
+    """As `begun`, of such a run until some time after the jump begins, or the fix is repeated; and how many messages that are."""
+    online, fed, n = _begun_alone(of, case, after_s)
+    return copied(online), fed.copied(), n
+
+
 @pytest.mark.parametrize("hz", [1.0, 5.0])
 def test_a_receiver_alone_that_repeats_a_fix_is_not_followed_nor_where_it_goes_on(hz: float) -> None:
     """It was followed for 33 m, and its going on then taken for a jump: 62 m off."""
     run, repeated, begin, end = hung(hz, 12.0)
-    fed = finish(online := smoother(run), feed(online, run, repeated))
+    online, fed, n = begun_alone(hung, (hz, 12.0), 5.0)
+    finish(online, feed(online, run, repeated[n:], fed))
     off_m, t_s = np.array(fed.errors_m), (np.array(fed.true_ns) - begin) * 1e-9
     sigma_m = np.sqrt([np.trace(e.cov[:2, :2]) for e in fed.estimates])
     assert (off_m < 2.5 * sigma_m).all()
@@ -532,8 +578,8 @@ def test_fixes_that_turn_out_to_have_been_repeated_are_taken_out(monkeypatch: py
 def test_a_window_that_is_rebuilt_holds_repeated_fixes_out(after_s: float) -> None:
     """Also where it begins among them, and has none from before."""
     run, repeated, begin, _ = hung(5.0, 12.0)
-    online = smoother(run)
-    feed(online, run, repeated[: next(k for k, a in enumerate(repeated) if a.true_ns > begin + after_s * 1e9)])
+    online, _, n = begun_alone(hung, (5.0, 12.0), 5.0)
+    feed(online, run, [a for a in repeated[n:] if a.true_ns <= begin + after_s * 1e9])
     online._rebuild("planted")  # noqa: SLF001
     assert online._tracking is not None  # noqa: SLF001
     lag = online._tracking.lag  # noqa: SLF001
@@ -545,8 +591,7 @@ def test_a_window_that_is_rebuilt_holds_repeated_fixes_out(after_s: float) -> No
 def test_an_estimate_that_restarts_takes_a_receiver_that_repeats_a_fix_as_it_is() -> None:
     """That it moved said the estimate that was given up; while it is at rest, and the receiver holds its position, nothing would tell."""
     run, repeated, begin, end = hung(5.0, 12.0)
-    online = smoother(run)
-    feed(online, run, repeated[: next(k for k, a in enumerate(repeated) if a.true_ns > begin + 5_000_000_000)])
+    online, _, _ = begun_alone(hung, (5.0, 12.0), 5.0)
     assert online._tracking is not None  # noqa: SLF001
     assert online._tracking.lag.frozen_receivers == {"gnss"}  # noqa: SLF001
     online._restart("planted")  # noqa: SLF001
@@ -570,9 +615,9 @@ def test_a_jump_is_found_among_many_fixes_to_a_state() -> None:
 
 def test_a_window_that_is_rebuilt_amid_a_suspicion_has_the_fixes_before_it() -> None:
     """Where it turns out to be a burst of outliers, they come in no second time."""
-    run, jumped, begin, end = jumping(5.0, 0.45, 2.0, 7.0, 9.1)
-    online, now = smoother(run), next(k for k, a in enumerate(jumped) if a.true_ns > begin + 600_000_000)
-    fed = feed(online, run, jumped[:now])
+    case = (5.0, 0.45, 2.0, 7.0, 9.1)
+    run, jumped, begin, end = jumping(*case)
+    online, fed, now = begun_alone(jumping, case, 0.6)
     assert online._tracking is not None  # noqa: SLF001
     assert online._tracking.lag.problem.streams["gnss"].receiver.jump.suspects(online._tracking.lag.newest.stamp_ns)  # noqa: SLF001
     online._rebuild("planted")  # noqa: SLF001
@@ -603,10 +648,10 @@ def test_fixes_of_a_receiver_that_is_said_not_to_jump_are_used_after_a_jump() ->
 
 def test_no_window_begins_where_a_jump_was_not_known_yet() -> None:
     """Estimates from between a jump and its detection have the slow error of before it: a rebuild 9 s later was 8 m off."""
-    run, jumped, begin, _ = jumping(5.0, 0.45, 2.0, 7.0, 9.1)
-    online = smoother(run)
-    n = next(k for k, a in enumerate(jumped) if a.true_ns > begin + 1_800_000_000)
-    fed = feed(online, run, jumped[:n])
+    case = (5.0, 0.45, 2.0, 7.0, 9.1)
+    run, jumped, begin, _ = jumping(*case)
+    online, fed, n = begun_alone(jumping, case, 0.6)
+    feed(online, run, [a for a in jumped[n:] if a.true_ns <= begin + 1_800_000_000], fed)
     assert [e for e in fed.events if "position jump" in e and "rebuilt" in e]
     assert online._tracking is not None  # noqa: SLF001
     stamps_ns = [anchor.stamp_ns for anchor in online._tracking._recent.anchors]  # noqa: SLF001
@@ -615,10 +660,9 @@ def test_no_window_begins_where_a_jump_was_not_known_yet() -> None:
 
 
 def test_odometry_continues_when_the_clock_is_set_back() -> None:
-    base, online = arrivals_of(run_of()), smoother(run_of())
+    base, (online, before) = arrivals_of(run_of()), begun(10.0)
     n = at_s(base, 10.0)
     back = [replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns - 3_600_000_000_000)) for a in base[n:]]
-    before = feed(online, run_of(), base[:n])
     after = feed(online, run_of(), back)
     assert [e for e in after.events if "set back" in e]
     walked = run_of().truth.at(np.array([after.true_ns[0], after.true_ns[-1]])).p_world_m
@@ -665,9 +709,8 @@ def broken_at(
 @pytest.mark.parametrize("error", [RuntimeError("planted"), MemoryError(), ValueError("planted")])
 def test_a_rebuild_loses_nothing(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     """One failure of the solver in the middle: a second later the estimate is that of the run without it, to cm."""
-    every, online = arrivals_of(run_of()), smoother(run_of())
+    every, (online, fed) = arrivals_of(run_of()), begun(10.0)
     n, base = at_s(every, 10.0), every[: at_s(every, 13.0)]
-    fed = feed(online, run_of(), base[:n])
     with monkeypatch.context() as patch:
         raised = broken_at(patch, Window, "commit", lambda k: k == 1, error)
         feed(online, run_of(), base[n : n + 30], fed)
@@ -686,9 +729,9 @@ def test_a_rebuild_loses_nothing(monkeypatch: pytest.MonkeyPatch, error: Excepti
 
 def test_a_solver_that_runs_away_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps from far off may lead farther, and the linear algebra does not mind: 10^20 m were once given out."""
-    every, online = arrivals_of(run_of()), smoother(run_of())
+    every, (online, fed) = arrivals_of(run_of()), begun(10.0)
     n, base = at_s(every, 10.0), every[: at_s(every, 13.0)]
-    fed, commit, lost = feed(online, run_of(), base[:n]), Window.commit, list[Window]()
+    commit, lost = Window.commit, list[Window]()
 
     def astray(window: Window) -> None:
         """The first window goes, whatever is solved again; another that is built anew does not."""
@@ -714,9 +757,8 @@ def test_exceptions_in_the_solver_are_survived(
     monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, share: float
 ) -> None:
     every, rng = arrivals_of(run_of()), np.random.default_rng(4)
-    online, base = smoother(run_of()), every[: at_s(every, 23.0)]
+    (online, fed), base = begun(6.0), every[: at_s(every, 23.0)]
     n = at_s(base, 6.0)
-    fed = feed(online, run_of(), base[:n])
     with monkeypatch.context() as patch:
         errors = [RuntimeError("planted"), MemoryError(), ValueError("planted")]
         raised = broken_at(patch, owner, name, lambda _: bool(rng.random() < share), errors[int(rng.integers(3))])

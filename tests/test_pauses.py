@@ -13,11 +13,11 @@ from graphloc.config import ImuConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.factors.imu import ROW
 from graphloc.frames import Array
-from graphloc.frontends.inspect import inspect_bag
 from graphloc.graph import Going
 from graphloc.measurements import ImuSeries
 from graphloc.signals.pauses import Stamps, common_pauses
-from tests.bagfactory import START_NS, Messages, write_bag
+from tests.bagfactory import START_NS, Messages
+from tests.heldbags import hold_bag, inspect_bag
 from tests.slowly import simulate_slowly
 from tests.test_inspect import drive
 
@@ -140,6 +140,6 @@ def test_inspect_says_that_all_sensors_pause(tmp_path: Path) -> None:
                 m.header.stamp.sec + m.header.stamp.nanosec // S,
                 m.header.stamp.nanosec % S,
             )
-    found = inspect_bag(write_bag(tmp_path / "run", make, [item[:3] for item in items], "mcap"))
+    found = inspect_bag(hold_bag(tmp_path / "run", make, [item[:3] for item in items]))
     (said,) = (warning for warning in found.warnings if "all sensors pause" in warning)
     assert "either nothing was recorded meanwhile, or the computer's clock" in said

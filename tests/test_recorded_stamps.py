@@ -11,12 +11,12 @@ import pytest
 from graphloc.app import configured
 from graphloc.config import ImuConfig, VesselConfig
 from graphloc.frontends._clock import ClockStep, gain, leaps
-from graphloc.frontends.bag import read_recording
-from graphloc.frontends.inspect import draft_config, inspect_bag
+from graphloc.frontends.inspect import draft_config
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition
 from graphloc.time import duration_ns, utc_text
-from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.bagfactory import START_NS, Item, Messages, S
+from tests.heldbags import hold_bag, inspect_bag, read_recording
 from tests.test_bag_bad_input import accounted, vessel
 from tests.test_inspect import drive, look
 
@@ -93,7 +93,7 @@ def test_a_truth_without_stamps_is_compared_by_the_recording_times(tmp_path: Pat
     for k in range(200):
         at_ns = START_NS + k * S // 10
         items.append(("/truth", at_ns, MAKE.odometry(0, (0.1 * k, 0.0, 0.0))))
-    path = write_bag(tmp_path / "run", MAKE, sorted(items, key=lambda item: item[1]), "mcap")
+    path = hold_bag(tmp_path / "run", MAKE, items)
     recording = read_recording(path, vessel().model_copy(update={"truth_topic": "/truth"}))
     assert recording.truth is not None
     assert recording.truth.stamps_ns.tolist() == [START_NS + k * S // 10 for k in range(200)]
@@ -327,7 +327,7 @@ def test_scans_and_images_without_usable_stamps_are_drafted_by_the_recording_tim
         ),
     }  # fmt: skip
     items += [("/seen", START_NS + S // 10, seen[kind])]
-    path = write_bag(tmp_path / "run", MAKE, sorted(items, key=lambda item: item[1]), "mcap")
+    path = hold_bag(tmp_path / "run", MAKE, items)
     (tmp_path / "vessel.yaml").write_text(draft_config(inspect_bag(path)))
     (sensor,) = (s for s in configured(tmp_path / "vessel.yaml").sensors.values() if s.kind == kind)
     assert sensor.stamps == ("recorded" if recorded else "header")

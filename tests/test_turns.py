@@ -26,11 +26,11 @@ from graphloc.frontends._turns import (
     wander_deg,
     wander_warning,
 )
-from graphloc.frontends.bag import _turn_warnings, read_recording
-from graphloc.frontends.inspect import inspect_bag
+from graphloc.frontends.bag import _turn_warnings
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries
 from graphloc.time import stamps_of
-from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.bagfactory import START_NS, Item, Messages, S
+from tests.heldbags import hold_bag, inspect_bag, read_recording
 from tests.test_bag_bad_input import accounted, rows_of, vessel
 
 
@@ -305,7 +305,7 @@ def test_a_bag_in_another_unit_is_refused(told: str, tmp_path: Path) -> None:
             items.append(("/compass", stamp, make.compass(stamp, q)))
             items.append(("/pose", stamp, make.pose(stamp, (east, north, 0.0), q)))
             items.append(("/gnss", stamp, make.fix(stamp, north / 111e3, east / 111e3)))
-    path = write_bag(tmp_path / "run", make, items, "mcap")
+    path = hold_bag(tmp_path / "run", make, items)
     sensors = {"gnss": None, told: {"topic": f"/{told}"}}
     read_recording(path, vessel(**sensors, imu={"topic": "/imu"}))
     with pytest.raises(InputError, match=rf"{told}, in step with them.* set gyro_unit: rad/s of sensors\.imu"):
@@ -324,7 +324,7 @@ def test_a_bag_is_looked_at(tmp_path: object) -> None:
             half = -0.5 * (1.0 - np.cos(0.2 * k / 50.0))
             items.append(("/compass", stamp, make.compass(stamp, (0, 0, np.sin(half), np.cos(half)))))
             items.append(("/pose", stamp, make.pose(stamp, (0, 0, 0), (0, 0, np.sin(half), np.cos(half)))))
-    path = write_bag(tmp_path / "run", make, items, "mcap")  # type: ignore[operator]
+    path = hold_bag(tmp_path / "run", make, items)  # type: ignore[operator]
     for convention, said in (("enu", 1), ("ned", 0)):
         config = vessel(gnss=None, imu={"topic": "/imu"}, compass={"topic": "/compass", "convention": convention})
         found = [w for w in read_recording(path, config).warnings if "turn the other way" in w]
@@ -390,7 +390,7 @@ def test_a_bag_with_scattered_headings_has_rows_for_them(tmp_path: Path) -> None
         if k % 5 == 0:
             half = rng.uniform(-np.pi, np.pi) if k < 500 else 0.3
             items.append(("/compass", stamp, make.compass(stamp, (0, 0, np.sin(half), np.cos(half)))))
-    path = write_bag(tmp_path / "run", make, items, "mcap")
+    path = hold_bag(tmp_path / "run", make, items)
     recording = read_recording(
         path, vessel(gnss=None, imu=None, compass={"topic": "/compass"}, gyro={"topic": "/imu", "kind": "imu"})
     )

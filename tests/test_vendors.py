@@ -25,13 +25,13 @@ from graphloc.frontends._reports import EAST_AXES, NORTH_AXES
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._types import MessageTypes
 from graphloc.frontends._vendor_types import VENDOR_TYPES
-from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import DECODERS, QUATERNION, TWIST, ImuReading, stamp_ns_of
-from graphloc.frontends.inspect import draft_config, inspect_bag, render
+from graphloc.frontends.inspect import draft_config, render
 from graphloc.frontends.vendors import VENDORS
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
+from tests.heldbags import inspect_bag, read_recording
 from tests.makers import said
 from tests.test_bag import KINDS
 from tests.test_inspect import drive, look
