@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """GNSS velocity of the antenna.
 
-    z = v + dv + R (omega x (l + o)) + a tau + w,   w ~ N(0, C)
+    z = v + dv + R (omega x (l + o)) + a tau + d + w,   w ~ N(0, C + W),   d: first-order Gauss-Markov per axis
     a = R (f + alpha x (l + o) + omega x (omega x (l + o))) + g
 
 v: velocity of body in world at the state; dv: its change until the measurement, by the IMU; omega: body rate from the gyroscope,
 bias removed; l: antenna in body; o: how far from there it sits, a constant of the run, where that is not known; a: acceleration of
 the antenna, by the specific force f and the change alpha of the body rate; tau: how much later than stamped it was measured
-(negative: stamped late), a constant of the run, where that is not known. d z / d v = I,
+(negative: stamped late), a constant of the run, where that is not known; W: what d walks between its nodes (`Attachment.slow_walk`).
+The slow state holds n = -d, as that of `gnss`. d z / d v = I,
 d z / d theta = -R [omega x (l + o) + (f + ...) tau]_x. The lever-arm term carries information: in waves it shows the heading. With R fixed at the
 estimate in it, passes converged slowly (not after 6). dv and omega are taken from the estimate at every pass; dv within half a period
 of the states turns by 9 mm/s for 1 deg of attitude. Not handled: of tau what a changes by in that time.
@@ -21,7 +22,7 @@ from graphloc.config import VelocityConfig
 from graphloc.factors._noise import with_floors
 from graphloc.factors._receiver import late_and_off, stamps_and_antenna
 from graphloc.frames import Array, Datum, skew
-from graphloc.graph import Attachment, Hint, Residual, Sensor
+from graphloc.graph import Attachment, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import GnssVelocity
 
 
@@ -29,7 +30,9 @@ def _predicted_mps(at: Attachment, config: VelocityConfig) -> Array:
     """The velocity (3,) without noise, in world."""
     late, off = late_and_off(at, config)
     v = at.sensor_velocity_mps(off)
-    return v + at.sensor_acceleration_mps2(off) * late if late else v
+    if late:
+        v = v + at.sensor_acceleration_mps2(off) * late
+    return v if at.slow_value is None else v - at.slow_value
 
 
 def _attitude_jacobian(at: Attachment, config: VelocityConfig) -> Array:
@@ -56,17 +59,36 @@ def _by_constants(at: Attachment, config: VelocityConfig) -> tuple[Array, ...]:
 def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[Residual, ...]:
     """Return predicted - measured (3,), m/s, in world."""
     raw = _predicted_mps(at, config) - m.v_world_mps
+    white = with_floors(m.cov_m2ps2, config.min_sigma_mps**2)
+    cov = white + at.walked()
     return (
         Residual(
             raw=raw,
-            cov=with_floors(m.cov_m2ps2, config.min_sigma_mps**2),
+            cov=cov,
+            white=white,
             jacobian=lambda: _attitude_jacobian(at, config),
             velocity_jacobian=lambda: np.eye(3),
+            slow_jacobian=lambda: -np.eye(3),
             constant_jacobians=lambda: _by_constants(at, config),
             prior=1.0,
             size_m=None,
             size_deg=None,
+            expected_nis=float(np.trace(np.linalg.solve(cov, white))),
         ),
+    )
+
+
+def slow(config: VelocityConfig) -> SlowProcess | None:
+    """Return the error that lasts for seconds; None if none is modelled."""
+    if config.wander_sigma_mps == 0.0:
+        return None
+    return SlowProcess(
+        name="GNSS velocity error",
+        axes=("east", "north", "up"),
+        units=("m/s", "m/s", "m/s"),
+        scale=np.full(3, -1.0),
+        sigma=np.full(3, config.wander_sigma_mps),
+        time_constant_s=np.full(3, config.wander_time_constant_s),
     )
 
 
@@ -93,6 +115,7 @@ ROW = Sensor(
     residuals=residuals,
     ideal=ideal,
     hint=hint,
+    slow=slow,
     constants=stamps_and_antenna,
     company=True,
 )

@@ -18,6 +18,10 @@ from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor
 
 
+_jacobian_factor: Any = gtsam.JacobianFactor  # the stubs know one overload per number of states
+_SPLIT = (1 << 62) + 1  # key of a variable that is in no graph
+
+
 @cache
 def _unit(rows: int) -> Any:
     return gtsam.noiseModel.Unit.Create(rows)
@@ -103,6 +107,26 @@ def linear_update(
         arguments += [term.key, whiten * term.jacobian if single else whiten @ term.jacobian]
         if term.offset is not None:
             raw = raw - term.jacobian @ term.offset
-    make: Any = gtsam.JacobianFactor  # the stubs know one overload per number of states
+    make: Any = (
+        gtsam.JacobianFactor if len(terms) < 4 else _of_four_states
+    )  # the stubs know one overload per number of states
     linear = make(*arguments, -whiten @ raw, _unit(len(raw)))
     return GraphUpdate(factors=(gtsam.LinearContainerFactor(linear, points),))
+
+
+def _of_four_states(*arguments: Any) -> Any:
+    """Return a `JacobianFactor` of four states, which Python cannot make (0.09 ms instead of 0.01).
+
+    Two factors share a variable, y + A1 x1 + A2 x2 = b and y = A3 x3 + A4 x4, and y is eliminated.
+    """
+    (*of_two, third, A3, fourth, A4, b, unit), rows = arguments, len(arguments[-2])
+    split = gtsam.GaussianFactorGraph()
+    split.add(_jacobian_factor(_SPLIT, np.eye(rows), *of_two, b, unit))
+    held = gtsam.noiseModel.Constrained.All(rows)
+    split.add(gtsam.JacobianFactor(_SPLIT, -np.eye(rows), third, A3, fourth, A4, np.zeros(rows), held))
+    order = gtsam.Ordering()
+    order.push_back(_SPLIT)
+    joined: Any = split.eliminatePartialSequential(order)[1].at(0)
+    whitened = joined.whiten()
+    whitened.setModel(False, np.ones(rows))  # without one, `dim()` of its container reads a null pointer
+    return whitened

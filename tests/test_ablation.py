@@ -80,7 +80,9 @@ def test_a_bad_compass_shows_without_truth(bad: tuple[SimulatedRun, Ablated]) ->
 def test_of_two_that_contradict_each_other_the_rest_names_the_likelier_culprit() -> None:
     """Fixes good to centimetres that hardly drift know the heading of a vessel that turns to some degrees."""
     run = made(compass_offset_deg=OFF_DEG, path="loops", duration_s=24.0, gnss_sigma_m=0.05)
-    steady = run.config.sensors["gnss"].model_copy(update={"slow_error": SlowErrorConfig(horizontal_sigma_m=0.1)})
+    steady = run.config.sensors["gnss"].model_copy(
+        update={"slow_error": SlowErrorConfig(horizontal_sigma_m=0.1, vertical_sigma_m=0.2)}
+    )
     config = run.config.model_copy(update={"sensors": {**run.config.sensors, "gnss": steady}})
     found = ablate(replace(run.recording, truth=None), config)
     assert suspects(found.effects)[0] == "compass"

@@ -45,7 +45,7 @@ def at_truth() -> tuple[Problem, gtsam.Values]:
     imu = run.recording.imu
     assert imu is not None
     bias = np.array([0.0, 0.0, GYRO_BIAS_RADPS])
-    vel = VelocityConfig(topic="/v", mount=MountConfig(xyz_m=tuple(LEVER_M)))
+    vel = VelocityConfig(topic="/v", mount=MountConfig(xyz_m=tuple(LEVER_M)), wander_sigma_mps=0.0)
     usual = run.config.sensors["imu"].model_copy(
         update={"gyro_noise_mdps_per_sqrt_hz": 8.0, "accel_noise_ug_per_sqrt_hz": 300.0}
     )

@@ -58,7 +58,7 @@ def late(stamp_sigma_s: float, late_s: float = LATE_S) -> SimulatedRun:
         {
             "imu": run.config.sensors["imu"].model_copy(update={"mount_sigma_deg": 0.0}),
             "gnss": gnss.model_copy(update={"slow_error": slow}),
-            "velocity": VelocityConfig(mount=gnss.mount, stamp_sigma_s=stamp_sigma_s),
+            "velocity": VelocityConfig(mount=gnss.mount, stamp_sigma_s=stamp_sigma_s, wander_sigma_mps=0.0),
         }
     )
     return replace(run, recording=recording, config=with_few_states(config, 5.0))
@@ -77,7 +77,7 @@ def replayed(stamp_sigma_s: float, late_s: float = LATE_S) -> Solution:
 
 def test_the_jacobians_are_those_of_the_residual() -> None:
     """By attitude, velocity, time and place, against differences of the residual itself."""
-    config = VelocityConfig(stamp_sigma_s=0.1, mount_sigma_m=1.0)
+    config = VelocityConfig(stamp_sigma_s=0.1, mount_sigma_m=1.0, wander_sigma_mps=0.0)
     value = np.array([-0.2, 0.5, -0.3, 0.8])
 
     def there(at: Attachment, step: Array) -> Attachment:
@@ -103,7 +103,7 @@ def test_the_jacobians_are_those_of_the_residual() -> None:
 
 def test_a_velocity_is_that_of_the_antenna_at_another_time() -> None:
     """On a circle, rolling: where a mast swings, its acceleration is far from that of the hull."""
-    config, rate, lever = VelocityConfig(stamp_sigma_s=0.1), 0.3, np.array([1.0, -0.5, 8.0])
+    config, rate, lever = VelocityConfig(stamp_sigma_s=0.1, wander_sigma_mps=0.0), 0.3, np.array([1.0, -0.5, 8.0])
 
     def moving(t: float) -> tuple[Array, Array]:
         """Attitude and velocity of a vessel that goes 5 m/s."""

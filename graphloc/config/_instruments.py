@@ -206,6 +206,10 @@ class VelocityConfig(SensorConfig):
     """Floor of the velocity sigma, m/s."""
     default_sigma_mps: Positive = 0.3
     """Sigma if the message reports no covariance, m/s."""
+    wander_sigma_mps: NonNegative = 0.03
+    """Error that lasts for seconds (multipath, the receiver's own filter), 1 sigma, each axis, m/s; on top of what it reports. 0: none."""
+    wander_time_constant_s: Positive = 20.0
+    """Correlation time of that error, s."""
     stamp_sigma_s: NonNegative = 0.0
     """Unknown delay of its stamps beyond `time_offset_s`, 1 sigma, s; as that of `gnss`. A late velocity turns the heading where that comes
     from the motion: 0.1 s by as much as the vessel turns in 0.1 s."""
