@@ -20,8 +20,7 @@ from graphloc.eval.report._theses import _gnss_error_m
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import gnss, velocity
 from graphloc.frames import Array, wrap_angle
-from graphloc.graph import PLACE, Attachment, Decision, Sensor, antenna_off_m, corrections
-from graphloc.linear import factors_of
+from graphloc.graph import PLACE, Attachment, antenna_off_m, corrections
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.online._lag import Lag
 from graphloc.online._live import LiveStream, ReceiverDetectors
@@ -29,7 +28,7 @@ from graphloc.online._receiver_checks import ReceiverChecks, _antenna
 from graphloc.replay import replay
 from tests.faults import Fed, arrivals_of, feed
 from tests.slowly import with_few_states
-from tests.test_factors import attachment, values_of
+from tests.test_factors import attachment
 from tests.test_late_fixes import SCENARIO, offline, online, solved
 from tests.test_online_faults import smoother
 
@@ -57,34 +56,6 @@ def displaced(
 
 def displacing(at: Attachment, value: Array) -> Attachment:
     return replace(at, constants=((6, value),))
-
-
-@pytest.mark.parametrize(
-    ("row", "config", "value"),
-    [
-        pytest.param(gnss.ROW, GNSS, np.array([0.07, *OFF_M]), id="fix"),
-        pytest.param(gnss.ROW, GNSS.model_copy(update={"stamp_sigma_s": 0.0}), OFF_M, id="fix-in-time"),
-        pytest.param(velocity.ROW, VelocityConfig(kind="gnss_velocity", mount_sigma_m=1.0), OFF_M, id="velocity"),
-    ],
-)
-def test_the_jacobians_are_those_of_the_residual(row: Sensor, config: Any, value: Array) -> None:
-    """By attitude and by each constant, against differences of the residual itself."""
-    at = displacing(attachment(row, config, slow=False), value)
-    m = row.ideal(at, config)
-    (factor,) = factors_of(row, m, config, at, Decision()).factors
-    values = values_of(at, ())
-    values.insert(6, value)
-    linear, residual = factor.linearize(values), row.residuals(m, config, at)[0]
-    assert residual.raw == pytest.approx(np.zeros(3), abs=1e-6)
-    tiny = 1e-4 * np.eye(6)[:3]
-    turned = [replace(at, T_world_body=at.T_world_body.retract(step)) for step in tiny]
-    moved = [displacing(at, value + step) for step in 1e-4 * np.eye(len(value))]
-    changes = np.array([row.residuals(m, config, there)[0].raw / 1e-4 for there in (*turned, *moved)])
-    assert np.linalg.norm(changes, axis=1).min() > 0.01
-    J = np.linalg.cholesky(residual.cov) @ linear.jacobian()[0]
-    np.testing.assert_allclose(
-        J[:, [0, 1, 2, *range(J.shape[1] - len(value), J.shape[1])]].T, changes, rtol=1e-3, atol=1e-3
-    )
 
 
 def test_an_antenna_is_where_a_mount_there_has_it() -> None:

@@ -4,7 +4,6 @@
 from dataclasses import replace
 from functools import cache
 
-import numpy as np
 import pytest
 
 from graphloc import app
@@ -12,13 +11,9 @@ from graphloc.config import GnssConfig
 from graphloc.eval.holdout import HoldOut
 from graphloc.eval.metrics import TruthMetrics, compare_to_held_out, compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
-from graphloc.factors.gnss import ROW
-from graphloc.graph import Decision
-from graphloc.linear import factors_of
 from graphloc.measurements import GnssPosition
 from graphloc.replay import replay
 from tests.slowly import with_few_states
-from tests.test_factors import attachment, values_of
 
 LATE_S = 0.1
 SCENARIO = Scenario(
@@ -67,31 +62,6 @@ def offline(run: SimulatedRun) -> TruthMetrics:
 
 def online(run: SimulatedRun) -> TruthMetrics:
     return compare_to_truth(replay(run.recording, run.config).solution.trajectory, run.truth)
-
-
-def test_the_jacobians_are_those_of_the_residual() -> None:
-    """By place, slow error and time, against differences of the residual itself."""
-    config = GnssConfig(kind="gnss", stamp_sigma_s=0.1)
-    at = replace(attachment(ROW, config), constants=((6, np.array([0.07])),))
-    assert at.slow_value is not None
-    m = ROW.ideal(at, config)
-    (factor,) = factors_of(ROW, m, config, at, Decision()).factors
-    values = values_of(at, ())
-    values.insert(6, np.array([0.07]))
-    found = factor.linearize(values)
-    residual = ROW.residuals(m, config, at)[0]
-    assert residual.raw == pytest.approx(np.zeros(3), abs=1e-6)
-    ahead = at.T_world_body.retract(np.array([0.0, 0.0, 0.0, 1e-4, 0.0, 0.0]))
-    moved = (
-        replace(at, T_world_body=ahead),
-        replace(at, slow_value=at.slow_value + np.array([1e-4, 0.0, 0.0])),
-        replace(at, constants=((6, np.array([0.07 + 1e-4])),)),
-    )
-    changes = [ROW.residuals(m, config, there)[0].raw / 1e-4 for there in moved]
-    assert list(found.keys()) == [at.pose_key, at.slow_key, 6]
-    assert np.linalg.norm(changes[2]) > 0.5  # m/s
-    for change, column in zip(changes, found.jacobian()[0].T[[3, 6, 9]], strict=True):
-        np.testing.assert_allclose(np.linalg.cholesky(residual.cov) @ column, change, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize(("mode", "slow"), [(offline, False), (online, True)], ids=["offline", "online-slow"])

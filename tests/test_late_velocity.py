@@ -16,14 +16,13 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL
 from graphloc.factors.velocity import ROW
 from graphloc.frames import Array
-from graphloc.graph import Attachment, Decision, FeltMotion
-from graphloc.linear import factors_of
+from graphloc.graph import FeltMotion
 from graphloc.measurements import GnssVelocity, ImuSeries
 from graphloc.replay import replay
 from graphloc.solution import Solution
 from tests.bagfactory import Messages
 from tests.slowly import with_few_states
-from tests.test_factors import attachment, values_of
+from tests.test_factors import attachment
 from tests.test_inspect import DATUM, drive, look
 from tests.test_odd_vessels import antenna_velocity
 
@@ -73,32 +72,6 @@ def solved(stamp_sigma_s: float, late_s: float = LATE_S) -> app.Run:
 def replayed(stamp_sigma_s: float, late_s: float = LATE_S) -> Solution:
     run = late(stamp_sigma_s, late_s)
     return replay(run.recording, run.config).solution
-
-
-def test_the_jacobians_are_those_of_the_residual() -> None:
-    """By attitude, velocity, time and place, against differences of the residual itself."""
-    config = VelocityConfig(stamp_sigma_s=0.1, mount_sigma_m=1.0, wander_sigma_mps=0.0)
-    value = np.array([-0.2, 0.5, -0.3, 0.8])
-
-    def there(at: Attachment, step: Array) -> Attachment:
-        """The attachment after a step in attitude (3,), velocity (3,) and constants (4,)."""
-        pose = at.T_world_body.retract(np.concatenate([step[:3], np.zeros(3)]))
-        constants = ((6, at.constants[0][1] + step[6:]),)
-        return replace(at, T_world_body=pose, v_world_mps=at.v_world_mps + step[3:6], constants=constants)
-
-    at = replace(attachment(ROW, config), constants=((6, value),), felt=FELT)
-    m = ROW.ideal(at, config)
-    (factor,) = factors_of(ROW, m, config, at, Decision()).factors
-    values = values_of(at, ())
-    values.insert(6, value)
-    found = factor.linearize(values)
-    assert list(found.keys()) == [at.pose_key, at.velocity_key, 6]
-    sigma = np.sqrt(ROW.residuals(m, config, at)[0].cov[0, 0])
-    columns = sigma * found.jacobian()[0][:, [0, 1, 2, *range(6, 13)]]
-    for k, column in enumerate(columns.T):
-        step = 1e-5 * np.eye(10)[k]
-        ahead, behind = (ROW.residuals(m, config, there(at, sign * step))[0].raw for sign in (1.0, -1.0))
-        np.testing.assert_allclose(column, (ahead - behind) / 2e-5, rtol=1e-6, atol=1e-7)
 
 
 def test_a_velocity_is_that_of_the_antenna_at_another_time() -> None:
