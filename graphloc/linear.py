@@ -17,7 +17,6 @@ from graphloc import gauss
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, Sensor
 
-
 _jacobian_factor: Any = gtsam.JacobianFactor  # the stubs know one overload per number of states
 _SPLIT = (1 << 62) + 1  # key of a variable that is in no graph
 

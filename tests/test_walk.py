@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphloc.build import walk_between_nodes
+from graphloc.build import spacing_s, walk_between_nodes
 from graphloc.config import GnssConfig
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, bl_scenario, simulate
@@ -66,6 +66,18 @@ def test_bounds_hold_beside_fixes_good_to_centimetres_that_walk() -> None:
     found = compare_to_truth(track, run.truth)
     assert found.nees is not None
     assert found.nees < 4.0  # 2 when true
+
+
+@pytest.mark.parametrize("burst", [1, 2, 5, 20])
+def test_fixes_in_bursts_tell_as_much_as_evenly_spaced_ones(burst: int) -> None:
+    """10 Hz on average. By the time between two of them, those of a burst of five would weigh a fortieth."""
+    came = np.arange(400)
+    stamps_ns = np.rint(((came // burst) * burst * 0.1 + (came % burst) * 0.002) * 1e9).astype(np.int64)
+    apart_s = spacing_s(stamps_ns)[100:]
+    white_m2 = 0.2**2
+    told = np.array([1.0 / (white_m2 + walk_between_nodes(SLOW, 1.0, float(each_s))[0]) for each_s in apart_s])
+    even = 1.0 / (white_m2 + walk_between_nodes(SLOW, 1.0, 0.1)[0])
+    assert told.mean() == pytest.approx(even, rel=0.05)
 
 
 def test_how_far_apart_fixes_are_does_not_depend_on_the_order_of_arrival() -> None:

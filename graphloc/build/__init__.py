@@ -26,6 +26,7 @@ from graphloc.build._attach import (
 from graphloc.build._chains import (
     CONSTANT_TAILS,
     JUMP,
+    SPACED_BY,
     at_level,
     bias_step,
     closing_variance,
@@ -33,6 +34,7 @@ from graphloc.build._chains import (
     slow_begin,
     slow_end,
     slow_step,
+    spacing_s,
     standing_cost,
     walk_between_nodes,
     without_drift,
@@ -76,6 +78,7 @@ from graphloc.build._thinned import Thinned, thinned
 __all__ = [
     "CONSTANT_TAILS",
     "JUMP",
+    "SPACED_BY",
     "Carry",
     "Decided",
     "Decisions",
@@ -114,6 +117,7 @@ __all__ = [
     "slow_or_left_out",
     "slow_step",
     "solved_constants",
+    "spacing_s",
     "standing_cost",
     "state_keys",
     "state_of",

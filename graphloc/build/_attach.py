@@ -153,7 +153,7 @@ class Attaching(Protocol):
 
     @property
     def apart_s(self) -> Any:
-        """Time since the measurement before, s; inf for the first."""
+        """How far apart they come at each, s (`spacing_s`)."""
         ...
 
 

@@ -24,6 +24,7 @@ from graphloc import keys
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import InertialLink, SlowProcess
+from graphloc.time import NS_PER_S, duration_ns
 
 # Loss of a step: beyond this many sigmas it counts as a jump.
 JUMP = KernelConfig(kind="cauchy", scale=2.0)
@@ -32,6 +33,9 @@ CONSTANT_TAILS = 9.0  # squared sigmas at which the variance of a constant's pri
 _NOTHING = 1e6  # sigmas: no information
 _NO_DRIFT = 100.0  # times the time constant
 _SILENT = 3.0  # times the usual time between measurements
+_SPACED_OVER_S = 4.0  # longer than gateways hold messages back
+SPACED_BY = 40
+"""Measurements up to one, at most, from which it is taken how far apart they come: of the fastest that are used two seconds."""
 _CHAIN_END = 2.0  # variances of the process: the prior at either end of a chain
 
 
@@ -126,6 +130,20 @@ def at_level(
     held = _usual_information(slow, dt_s, usual, anew)
     for n in np.flatnonzero(usual):
         yield _prior(names[int(n)], slow.sigma * np.where(slow.far_axes, np.sqrt(1.0 / held[n]), _NOTHING))
+
+
+def spacing_s(stamps_ns: NDArray[np.int64]) -> Array:
+    """Return how far apart measurements come (M,), s, each by the mean of the last seconds before it; inf for one alone.
+
+    Not by the one before alone, nor by the median: a gateway may send five fixes within 10 ms, twice a second.
+
+    Args:
+        stamps_ns: (M,) in order.
+    """
+    at = np.arange(len(stamps_ns))
+    first = np.maximum(np.searchsorted(stamps_ns, stamps_ns - duration_ns(_SPACED_OVER_S)), at - SPACED_BY)
+    mean_s = (stamps_ns - stamps_ns[first]) / NS_PER_S / np.maximum(at - first, 1)
+    return np.where(at > first, np.round(mean_s, 3), np.inf)  # rounded: many are then alike, and reckoned once
 
 
 @lru_cache(maxsize=256)  # many measurements are equally far apart

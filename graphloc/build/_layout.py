@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.build._attach import Carry, asks_for_delay, state_of
-from graphloc.build._chains import silent_s, without_drift
-from graphloc.build._problem import PositionJumps, Problem, Stream, apart_s_of, inertial_factors, preintegrate
+from graphloc.build._chains import silent_s, spacing_s, without_drift
+from graphloc.build._problem import PositionJumps, Problem, Stream, inertial_factors, preintegrate
 from graphloc.build._usable import silent_sensors, sorted_out, usable_imu
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import InputError
@@ -24,7 +24,7 @@ from graphloc.measurements import Measurement
 from graphloc.recording import Mounts, Recording
 from graphloc.signals.pauses import common_pauses, pauses_warning
 from graphloc.signals.position_jumps import allowed_jump_m, position_jumps
-from graphloc.time import stamps_of, utc_text
+from graphloc.time import NS_PER_S, stamps_of, utc_text
 from graphloc.timeline import Timeline, make_timeline
 
 _NO_JUMPS: PositionJumps = np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -178,7 +178,7 @@ def _streams(
         slow, left_out, jumps = _slow_and_jumps(row, config, own, problem.datum, company, alone=alone)
         by_waterline = height_told_better(problem.config, rows, slow_or_left_out(row, config, company)[1])
         state, carry = _states_and_carries(own, problem.timeline, problem.links)
-        constants, stamps_ns, apart_s = row.constants(config), stamps_of(own), apart_s_of(own)
+        constants, stamps_ns = row.constants(config), stamps_of(own)
         found.append(
             Stream(
                 number=number,
@@ -197,8 +197,8 @@ def _streams(
                 carry=carry,
                 gyro_radps=problem.links.gyro_at(stamps_ns),
                 felt=problem.links.felt_at(stamps_ns) if asks_for_delay(constants) else np.zeros((len(own), 6)),
-                apart_s=apart_s,
-                anew=_drawn_anew(slow, apart_s, problem.timeline.slow_of[state]),
+                apart_s=spacing_s(stamps_ns),
+                anew=_drawn_anew(slow, np.diff(stamps_ns) / NS_PER_S, problem.timeline.slow_of[state]),
             )
         )
     return tuple(found)
@@ -219,11 +219,15 @@ def _slow_and_jumps(
 
 
 def _drawn_anew(slow: SlowProcess | None, apart_s: Array, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return `anew` of a `Stream`: the slow nodes of the last measurements before it was silent; `nodes`: (M,) that of each."""
-    if slow is None or len(apart_s) < 2:
+    """Return `anew` of a `Stream`: the slow nodes of the last measurements before it was silent.
+
+    Args:
+        apart_s: (M - 1,) between measurements. nodes: (M,) that of each.
+    """
+    if slow is None or len(apart_s) == 0:
         return np.zeros(0, dtype=np.int64)
-    silent = np.isfinite(apart_s) & (apart_s > silent_s(slow, float(np.median(apart_s[1:]))))
-    return np.asarray(np.roll(nodes, 1)[silent & (np.diff(nodes, prepend=nodes[0]) > 0)])
+    silent = apart_s > silent_s(slow, float(np.median(apart_s)))
+    return np.asarray(nodes[:-1][silent & (np.diff(nodes) > 0)])
 
 
 def jumping(stream: Stream, stamps_ns: NDArray[np.int64], sizes_m: Array) -> Stream:

@@ -17,12 +17,14 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build._attach import Carry, asks_for_delay, nav_state
+from graphloc.build._chains import spacing_s
 from graphloc.build._usual_motion import UsualMotion, usual_motion
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, Going, InertialLink, Sensor, SlowProcess
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement
+from graphloc.time import stamps_of
 from graphloc.timeline import Timeline
 
 PositionJumps = tuple[NDArray[np.int64], Array]
@@ -43,7 +45,7 @@ class Stream:
         measurements: M of them by stamp. state: (M,) the state of each (`state_of`). carry: for each, the preintegrated motion
             from the state before it; None where its stamp is that of a state.
         gyro_radps: (M, 3) raw rate at each measurement, body axes. felt: (M, 6) raw specific force and change of the rate about it; 0 where no delay is asked for.
-        apart_s: (M,) time since the measurement before; inf for the first.
+        apart_s: (M,) how far apart they come (`spacing_s`).
         shares: number of the sensor that has the same constants (`shared_constants`); None: they are its own.
         anew: after which slow nodes (K,) its slow error is drawn anew.
         usual: at which slow nodes (N,) its error is at its usual level; None: not known (see `solve/_levels.py`).
@@ -85,7 +87,7 @@ class Stream:
             carry=tuple(self.carry[i] for i in few),
             gyro_radps=self.gyro_radps[indices],
             felt=self.felt[indices],
-            apart_s=apart_s_of(measurements),
+            apart_s=spacing_s(stamps_of(measurements)),
         )
 
 
@@ -123,12 +125,6 @@ class Problem:
     left_out: tuple[tuple[int, int], ...] = ()
     imu_turn_rad: Array = field(default_factory=lambda: np.zeros(3))
     usual_motion: UsualMotion | None = None
-
-
-def apart_s_of(measurements: Sequence[Measurement]) -> Array:
-    """Return the time since the measurement before, of M measurements (M,), s; inf for the first."""
-    stamps_ns = [m.stamp_ns for m in measurements]
-    return np.concatenate([[np.inf], np.diff(stamps_ns) * 1e-9])[: len(stamps_ns)]
 
 
 def preintegrate(timeline: Timeline, links: InertialLink) -> tuple[Any, ...]:

@@ -5,16 +5,15 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Collection, MutableMapping, Sequence
+from collections.abc import Collection, MutableMapping
 from dataclasses import dataclass, field
-from itertools import pairwise
-from statistics import median
 from typing import Any, Generic, TypeVar
 
 import gtsam
 import numpy as np
 
 from graphloc.build import (
+    SPACED_BY,
     Carry,
     asks_for_delay,
     company_of,
@@ -24,6 +23,7 @@ from graphloc.build import (
     shared_constants,
     silent_s,
     slow_or_left_out,
+    spacing_s,
     state_of,
     without_drift,
 )
@@ -41,7 +41,6 @@ from graphloc.signals.position_jumps import JumpDetector, PositionJump
 from graphloc.time import NS_PER_S, duration_ns
 
 T = TypeVar("T")
-_LAST = 15  # measurements up to one, by stamp, from which a sensor's rate at it is taken
 _PAGE_S = 1.0  # states are marginalised in pages of this length
 
 
@@ -231,8 +230,11 @@ class LiveStream:
         first = bisect_left(self.by_stamp, taken)
         self.by_stamp.insert(first, taken)
         self.apart_s.append(math.inf)
-        for n in range(first, min(first + _LAST + 1, len(self.by_stamp))):
-            self.apart_s[self.by_stamp[n][1]] = _apart_s(self.by_stamp[max(n - _LAST, 0) : n + 1])
+        since = max(first - SPACED_BY, 0)
+        around = self.by_stamp[since : first + SPACED_BY + 1]
+        apart_s = spacing_s(np.array([stamp_ns for stamp_ns, _ in around]))
+        for n in range(first - since, len(around)):
+            self.apart_s[around[n][1]] = float(apart_s[n])
 
     def drawn_anew(self, stamp_ns: int) -> bool:
         """Return whether its slow error is drawn anew at a stamp: once as it has been silent for so long."""
@@ -391,8 +393,3 @@ def _live_stream(
         jumps=receiver.jump.jumps,
         told_ns=start_ns,
     )
-
-
-def _apart_s(last: Sequence[tuple[int, int]]) -> float:
-    """Return the median time (s) between measurements, given by stamp (ns) and index in order; inf for a single one."""
-    return float(median(b - a for (a, _), (b, _) in pairwise(last))) * 1e-9 if len(last) > 1 else math.inf
