@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Consistency of a sensor with a solution that did not use it.
 
-For each measurement z, in the solution without its sensor:  r = h(x) - z,  S = R + J P J^T + K Q K^T, with R the claimed covariance,
-P the solution's covariance of the pose, and Q the stationary covariance of the sensor's own slow error (K: d r / d slow).
-r^T S^-1 r is chi-square with dim r degrees of freedom if both covariances are honest. The measure is
+For each measurement z, in the solution without its sensor:  r = h(x) - z,  S = R + J P J^T + K Q K^T + C B C^T, with R the claimed
+covariance, P the solution's covariance of the pose, Q the stationary covariance of the sensor's own slow error (K: d r / d slow), and B
+that of its constants as configured (C: d r / d constants): place of an antenna, delay of stamps. What a survey of tags does not know is
+in the R of their poses.
+r^T S^-1 r is chi-square with dim r degrees of freedom if these covariances are honest. The measure is
 
     contradiction = sqrt(median of r^T S^-1 r / median of that chi-square)
 
 in sigmas: 1 if all is well, below 1 if slow errors are smaller than they might be. The median is robust against false
 measurements; for a sensor with a share f of them, the quantile 0.5 (1 - f), the median of the others, replaces it.
-Successive residuals share their errors, so no significance is stated.
+Successive residuals share their errors, a constant's all of them, so no significance is stated.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from graphloc.build import mount_of
 from graphloc.chi2 import chi2_median
 from graphloc.config import VesselConfig
 from graphloc.frames import Array
-from graphloc.graph import Attachment, Residual, Sensor
+from graphloc.graph import Attachment, FeltMotion, Residual, Sensor
 from graphloc.ledger import Outcome
 from graphloc.measurements import Measurement
 from graphloc.recording import Recording
@@ -45,6 +47,7 @@ class _There:
     v_world_mps: Array
     v_cov: Array
     gyro_radps: Array
+    felt: FeltMotion  # by the track
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,6 +98,9 @@ def _at(solution: Solution, measurements: Sequence[Measurement]) -> list[_There]
     nearest = np.abs(track.stamps_ns[None, :] - moments[:, None]).argmin(axis=1)
     assert there.cov is not None
     assert there.v_world_mps is not None
+    assert track.v_world_mps is not None
+    since_s = (track.stamps_ns - track.stamps_ns[0]) * 1e-9
+    a_world_mps2, spin_radps2 = (np.gradient(x, since_s, axis=0) for x in (track.v_world_mps, solution.gyro_radps))
     found = []
     for i in range(len(moments)):
         R = there.R_world_body[i]
@@ -107,6 +113,9 @@ def _at(solution: Solution, measurements: Sequence[Measurement]) -> list[_There]
                 v_world_mps=there.v_world_mps[i],
                 v_cov=solution.v_cov[nearest[i]],
                 gyro_radps=solution.gyro_radps[nearest[i]],
+                felt=FeltMotion(
+                    R.T @ a_world_mps2[nearest[i]], spin_radps2[nearest[i]], np.zeros(3)
+                ),  # gravity is not in it
             )
         )
     return [found[i] for i in index]
@@ -127,12 +136,14 @@ def _attachment(solution: Solution, there: _There, t: Array, R: Array) -> Attach
         lever_m=t,
         slow_value=None,
         datum=solution.datum,
+        felt=there.felt,
     )
 
 
 def _nis(m: Measurement, config: object, row: Sensor, at: Attachment, there: _There) -> tuple[float, Residual]:
     """Return the smallest normalised square of the hypotheses, and that hypothesis."""
-    slow = row.slow(config)
+    slow, constants = row.slow(config), row.constants(config)
+    at = replace(at, constants=tuple((0, np.zeros(len(c.sigma))) for c in constants))
     if slow is not None:
         at = replace(at, slow_key=0, slow_value=np.zeros(len(slow.sigma)))
     found = row.residuals(m, config, at)
@@ -149,6 +160,9 @@ def _nis(m: Measurement, config: object, row: Sensor, at: Attachment, there: _Th
         for i, (r, other) in enumerate(zip(found, moved, strict=True)):
             column = (other.raw - r.raw) / _STEP * slow.sigma[k]
             shared[i] = shared[i] + np.outer(column, column)
+    for i, r in enumerate(found):
+        for constant, jacobian in zip(constants, r.constant_jacobians(), strict=False):
+            shared[i] = shared[i] + (jacobian * constant.sigma**2) @ jacobian.T
     nis = [r.nis(s) for r, s in zip(found, shared, strict=True)]
     best = int(np.argmin(nis))
     return nis[best], found[best]

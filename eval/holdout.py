@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hold GNSS fixes out of a run to measure its accuracy: every n-th fix, or gaps of some seconds."""
+"""Hold GNSS fixes out of a run to measure its accuracy: every n-th fix, or gaps of some seconds, as if there were no GNSS."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from itertools import count
 from graphloc.config import VesselConfig
 from graphloc.errors import ConfigError
 from graphloc.ledger import Outcome
-from graphloc.measurements import GnssPosition
+from graphloc.measurements import GnssPosition, GnssVelocity, Measurement
 from graphloc.recording import Recording
 
 _MOST_GAPS, _GAP_S, _FEWEST_FIXES = 8, 10, 10
@@ -40,7 +40,10 @@ def telling(held: Sequence[GnssPosition], config: VesselConfig) -> tuple[GnssPos
 
 @dataclass(frozen=True, slots=True)
 class HoldOut:
-    """Every `every`-th fix, or `gaps` gaps of `gap_s` seconds each, spread evenly over the span of the fixes."""
+    """Every `every`-th fix, or `gaps` gaps of `gap_s` seconds each, spread evenly over the span of the fixes.
+
+    A gap is an outage of GNSS, as in a drill: its velocities are held out as well, and what other devices measure is not.
+    """
 
     every: int = 0
     gaps: int = 0
@@ -61,7 +64,7 @@ class HoldOut:
         raise ConfigError(f"--hold-out {text}: use every:N (N of 2 or more) or gaps:COUNTxSECONDS, e.g. gaps:8x10")
 
     def split(self, recording: Recording) -> tuple[Recording, tuple[GnssPosition, ...]]:
-        """Return the recording without the held-out fixes, which keep a row in its ledger, and these fixes.
+        """Return the recording without what is held out, which keeps a row in its ledger, and the held-out fixes.
 
         Raises:
             ConfigError: there are too few fixes, or the gaps would overlap.
@@ -80,14 +83,17 @@ class HoldOut:
         held = tuple(m for m in fixes if self._holds(next(number[m.sensor]), m, fixes))
         if not held:
             raise ConfigError(f"{recording.source}: --hold-out every:{self.every} holds nothing of {len(fixes)} fixes")
-        gone = {id(m) for m in held}
-        rows = (recording.row_of(m, Outcome.HELD_OUT, "kept out of the graph to test it") for m in held)
+        velocities = [m for m in recording.of(GnssVelocity) if self._in_a_gap(m, fixes)]
+        gone = {id(m) for m in (*held, *velocities)}
+        rows = [recording.row_of(m, Outcome.HELD_OUT, "kept out of the graph to test it") for m in held]
+        rows += [recording.row_of(m, Outcome.HELD_OUT, "kept out with the fixes of a gap") for m in velocities]
         kept = recording.where(lambda m: id(m) not in gone)
         return replace(kept, rows=(*recording.rows, *rows)), held
 
     def _holds(self, i: int, m: GnssPosition, fixes: list[GnssPosition]) -> bool:
-        if self.every:
-            return i % self.every == self.every - 1
+        return i % self.every == self.every - 1 if self.every else self._in_a_gap(m, fixes)
+
+    def _in_a_gap(self, m: Measurement, fixes: list[GnssPosition]) -> bool:
         span = (fixes[-1].stamp_ns - fixes[0].stamp_ns) * 1e-9
         at = (m.stamp_ns - fixes[0].stamp_ns) * 1e-9
         centres = (span * (n + 1.0) / (self.gaps + 1.0) for n in range(self.gaps))

@@ -340,7 +340,9 @@ def held_out_table(
 ) -> Table:
     """Return a table with a row per estimate, against held-out fixes; `slow` of each as for `compare_to_held_out`."""
     rows = [(name, compare_to_held_out(t, held, datum, antennas.of(name), slow.get(name))) for name, t in estimates]
-    return _table("Against held-out fixes", rows, "the fixes' own noise is part of the error")
+    return _table(
+        "Against held-out fixes", rows, "the fixes' own noise is part of the error; gaps lack GNSS velocities, too"
+    )
 
 
 def speed_table(estimates: _Named, check: SpeedSeries, switched_off: str = "") -> Table:

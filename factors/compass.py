@@ -38,8 +38,7 @@ def _sigmas(config: CompassConfig) -> Array:
 
 @lru_cache
 def _sigmas_of(mount_deg: float, deviation_deg: float, wander_deg: float) -> Array:
-    beside = (0.0,) * 5 if mount_deg == 0.0 else (*(deviation_deg * share for share in _SHARES), wander_deg)
-    sigmas = np.radians([mount_deg, *beside])
+    sigmas = np.radians([mount_deg, *(deviation_deg * share for share in _SHARES), wander_deg])
     sigmas.setflags(write=False)
     return sigmas
 

@@ -251,6 +251,19 @@ class Links:
         """Return the raw rates (M, 3), rad/s, in body axes."""
         return np.asarray(self._at(stamps_ns)[:, 3:] @ self._R_body_imu.T)
 
+    def gyro_variance_at(self, stamps_ns: NDArray[np.int64]) -> Array:
+        """Return the variances (M,), each axis, rad^2/s^2, of `gyro_at`: white noise of one sample; of unknown motion where there is none."""
+        steps = np.diff(self._stamps)
+        steps = steps[steps <= self._max_gap_ns]
+        variance = np.full(len(stamps_ns), _UNKNOWN_RADPS**2 / _FORGET_S)
+        if len(steps):
+            sampled = np.ones(len(stamps_ns), dtype=bool)
+            for after_ns, until_ns in self.gaps():
+                sampled &= (stamps_ns <= after_ns) | (stamps_ns >= until_ns)
+            sampled &= stamps_ns <= self._stamps[-1] + self._max_gap_ns
+            variance[sampled] = (self._config.gyro_noise_radps * self._noise_scale) ** 2 / (np.median(steps) * 1e-9)
+        return variance
+
     def felt_at(self, stamps_ns: NDArray[np.int64]) -> Array:
         """Return the raw specific force, m/s^2, and the change of the rate, rad/s^2 (M, 6), in body axes, each by means over 0.2 s."""
         stamps = self._stamps

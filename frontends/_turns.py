@@ -238,7 +238,7 @@ def _grown_of_unit(cells: Sequence[NDArray[np.intp]], covs: Sequence[Array]) -> 
 def wander_warning(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading], config: CompassConfig) -> list[str]:
     """Return a line if a compass wanders by far more than configured: the bounds of the heading would be too small."""
     found = wander_deg(imu, headings)
-    if found is None or config.mount_offset_sigma_deg == 0.0 or found < max(WANDERS_DEG, 2.0 * config.wander_sigma_deg):
+    if found is None or found < max(WANDERS_DEG, 2.0 * config.wander_sigma_deg):
         return []
     said = f"{sensor}: its error wanders by {found:.1f} deg beside the integrated gyro of {imu.sensor} (1 sigma, in a minute)"
     return [

@@ -37,7 +37,7 @@ class Estimate:
         cov: (6, 6) x, y, z (m) and small rotations (rad) about the world's axes. v_cov: (3, 3) of the velocity.
         p_odom_m, R_odom_body: (3,), (3, 3) in `odom`: smooth, never corrected, so it drifts.
         step_cov: (6, 6) of the odometry's step since the estimate before, as `cov`.
-        gyro_radps: (3,) rate of the body, body axes, bias removed.
+        gyro_radps: (3,) rate of the body, body axes, bias removed. gyro_cov: (3, 3) of it, rad^2/s^2.
         accel_bias_mps2, gyro_bias_radps: (3,) in IMU axes.
         health, reason: how far it can be trusted, and why not fully.
         since_agreed_s: s since each absolute sensor last agreed; inf: never.
@@ -53,6 +53,7 @@ class Estimate:
     R_odom_body: Array
     step_cov: Array
     gyro_radps: Array
+    gyro_cov: Array
     accel_bias_mps2: Array
     gyro_bias_radps: Array
     health: Health

@@ -454,6 +454,10 @@ class InertialLink(Protocol):
         """Return the raw angular rates (M, 3) in body axes at M stamps."""
         ...
 
+    def gyro_variance_at(self, stamps_ns: NDArray[np.int64]) -> Array:
+        """Return the variances (M,), each axis, rad^2/s^2, of what `gyro_at` gives, biases aside."""
+        ...
+
     def felt_at(self, stamps_ns: NDArray[np.int64]) -> Array:
         """Return specific force and change of the rate (M, 6) about M stamps, body axes, m/s^2 and rad/s^2; means, so that a hull may vibrate."""
         ...

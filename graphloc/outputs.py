@@ -31,10 +31,11 @@ from graphloc.frames import Array, heading_deg_from_yaw
 from graphloc.ledger import LedgerRow
 from graphloc.plain import plain
 from graphloc.recording import Span
-from graphloc.solution import Solution
+from graphloc.solution import Health, Solution
 from graphloc.time import utc_text
 from graphloc.trajectory import bounds_95
 
+_NO_FIX, _FIX = -1, 0  # of NavSatStatus
 MARK = "run.json"  # a folder with this file is ours to replace
 
 
@@ -146,7 +147,7 @@ def _bag(path: Path, solution: Solution, picked: Array, body_frame: str) -> None
             R = track.R_world_body[k]
             time = t["builtin_interfaces/msg/Time"](sec=stamp // 1_000_000_000, nanosec=stamp % 1_000_000_000)
             twist_cov = np.zeros((6, 6))
-            twist_cov[:3, :3] = R.T @ solution.v_cov[k] @ R
+            twist_cov[:3, :3], twist_cov[3:, 3:] = R.T @ solution.v_cov[k] @ R, solution.gyro_cov[k]
             message = t["nav_msgs/msg/Odometry"](
                 header=t["std_msgs/msg/Header"](stamp=time, frame_id="map"),
                 child_frame_id=body_frame,
@@ -166,7 +167,9 @@ def _bag(path: Path, solution: Solution, picked: Array, body_frame: str) -> None
                 ),
             )
             writer.write(odometry, stamp, store.serialize_cdr(message, "nav_msgs/msg/Odometry"))
-            status = t["sensor_msgs/msg/NavSatStatus"](status=0, service=1)
+            status = t["sensor_msgs/msg/NavSatStatus"](
+                status=_NO_FIX if solution.health[k] is Health.LOST else _FIX, service=1
+            )
             position = t["sensor_msgs/msg/NavSatFix"](
                 header=t["std_msgs/msg/Header"](stamp=time, frame_id=body_frame),
                 status=status,

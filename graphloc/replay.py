@@ -311,6 +311,7 @@ def _solution(
         accel_bias_mps2=np.array([e.accel_bias_mps2 for e in kept]),
         gyro_bias_radps=np.array([e.gyro_bias_radps for e in kept]),
         gyro_radps=np.array([e.gyro_radps for e in kept]),
+        gyro_cov=np.array([e.gyro_cov for e in kept]),
         health=tuple(e.health for e in kept),
         health_reason=tuple(e.reason for e in kept),
         since_agreed_s={n: np.array([e.since_agreed_s[n] for e in kept]) for n in names},

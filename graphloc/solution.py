@@ -137,7 +137,7 @@ class Solution:
         trajectory: poses, velocities and pose covariances of the states.
         v_cov: (N, 3, 3) covariance of velocity, world axes, m^2/s^2.
         accel_bias_mps2, gyro_bias_radps: (N, 3) in IMU axes.
-        gyro_radps: (N, 3) angular rate of the body, body axes, bias removed.
+        gyro_radps: (N, 3) angular rate of the body, body axes, bias removed. gyro_cov: (N, 3, 3) of it, rad^2/s^2.
         health, health_reason: N each.
         since_agreed_s: per absolute sensor, (N,) s since it last agreed (inf: never).
         slow: slow states by sensor.
@@ -155,6 +155,7 @@ class Solution:
     accel_bias_mps2: Array
     gyro_bias_radps: Array
     gyro_radps: Array
+    gyro_cov: Array
     health: tuple[Health, ...]
     health_reason: tuple[HealthReason, ...]
     since_agreed_s: Mapping[str, Array]

@@ -60,6 +60,7 @@ def as_json(estimate: Estimate, datum: Datum) -> dict[str, object]:
         "odom": _place(estimate.p_odom_m, estimate.R_odom_body),
         "map_from_odom": _place(*estimate.map_from_odom),
         "gyro_radps": estimate.gyro_radps.tolist(),
+        "gyro_cov_rad2ps2": estimate.gyro_cov.tolist(),
         "cov_m_rad": estimate.cov.tolist(),
         "velocity_cov_m2ps2": estimate.v_cov.tolist(),
         "bound_95_m": estimate.bound_95_m,

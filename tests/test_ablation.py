@@ -13,7 +13,8 @@ from scipy.stats import chi2
 
 from graphloc import app
 from graphloc.ablations import _Job, _smoothed, ablate
-from graphloc.config import SlowErrorConfig
+from graphloc.blocks import MountConfig
+from graphloc.config import GnssConfig, SlowErrorConfig
 from graphloc.errors import SolveError
 from graphloc.eval import ablation_page as page
 from graphloc.eval.ablation import Ablated, Effect, Off, Vote, suspects
@@ -24,7 +25,7 @@ from graphloc.eval.plots import Line
 from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.factors import SENSORS
 from graphloc.factors.velocity import VelocityConfig
-from graphloc.frames import Array
+from graphloc.frames import Array, Geodetic
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix, PoseMode
 from graphloc.solution import Solution
@@ -291,6 +292,80 @@ def test_a_velocity_counts_what_the_solution_knows_of_velocity(
     found = contradiction(known, replace(run.recording, measurements=made), config, "v", SENSORS)
     assert found is not None
     assert found.sigmas == pytest.approx(2.0 / np.sqrt((1.0 + 0.25) * chi2.median(3)), rel=0.02)
+
+
+def test_an_antenna_within_what_its_mount_is_known_to_is_no_contradiction(
+    bad: tuple[SimulatedRun, Ablated], whole: Solution
+) -> None:
+    """Fixes of an antenna 3 m ahead of where it is configured, in axes that are turned in body: 3 m over its 2 m, not over the noise."""
+    run, _ = bad
+    track = whole.trajectory
+    mount = MountConfig(xyz_m=(0.0, 0.0, 0.0), rpy_deg=(10.0, 20.0, 90.0))
+    p_m = track.p_world_m + track.R_world_body @ np.array([3.0, 0.0, 0.0])
+    fixes = tuple(
+        GnssPosition(
+            stamp_ns=int(s),
+            sensor="g",
+            seq=k,
+            position=Geodetic(*whole.datum.geodetic_from_enu(p)[0]),
+            cov_enu_m2=np.eye(3) * 1e-4,
+        )
+        for k, (s, p) in enumerate(zip(track.stamps_ns[5:-5], p_m[5:-5], strict=True))
+    )
+    sure = stated(whole, (1e-8,) * 6)
+    for mount_sigma_m in (0.0, 2.0):
+        config = run.config.model_copy(
+            update={
+                "sensors": {
+                    "g": GnssConfig(
+                        kind="gnss", mount=mount, mount_sigma_m=mount_sigma_m, slow_error=SlowErrorConfig(enabled=False),
+                        min_horizontal_sigma_m=0.01, min_vertical_sigma_m=0.01,
+                    )
+                }
+            }
+        )  # fmt: skip
+        found = contradiction(sure, replace(run.recording, measurements=fixes), config, "g", SENSORS)
+        assert found is not None
+        assert found.sigmas == pytest.approx(3.0 / np.sqrt((mount_sigma_m**2 + 1e-4) * chi2.median(3)), rel=0.02)
+
+
+def test_velocities_as_late_as_their_stamps_may_be_are_no_contradiction(
+    bad: tuple[SimulatedRun, Ablated], whole: Solution
+) -> None:
+    """A circle of 5 m in 10 s, antenna 4 m ahead, all stamps 0.4 s late of 0.2: the antenna's acceleration over 0.2 s, not over the noise."""
+    run, _ = bad
+    track, rate, late_s = whole.trajectory, 2.0 * np.pi / 10.0, 0.4
+    angle = rate * (track.stamps_ns - track.stamps_ns[0]) * 1e-9
+    out = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(track))])
+    along = np.column_stack([-np.sin(angle), np.cos(angle), np.zeros(len(track))])
+    R = np.stack([along, -out, np.tile([0.0, 0.0, 1.0], (len(track), 1))], axis=2)
+    turning = replace(
+        stated(whole, (1e-8,) * 6),
+        trajectory=replace(
+            stated(whole, (1e-8,) * 6).trajectory, p_world_m=5.0 * out, R_world_body=R, v_world_mps=5.0 * rate * along
+        ),
+        v_cov=np.tile(np.eye(3) * 1e-8, (len(track), 1, 1)),
+        gyro_radps=np.tile([0.0, 0.0, rate], (len(track), 1)),
+    )
+    antenna_mps = 5.0 * rate * along - 4.0 * rate * out  # w x (4 m along)
+    a_mps2 = -5.0 * rate**2 * out - 4.0 * rate**2 * along
+    made = tuple(
+        GnssVelocity(stamp_ns=int(s), sensor="v", seq=k, v_world_mps=v, cov_m2ps2=np.eye(3) * 0.01)
+        for k, (s, v) in enumerate(zip(track.stamps_ns[5:-5], (antenna_mps + late_s * a_mps2)[5:-5], strict=True))
+    )
+    for stamp_sigma_s in (0.0, 0.2):
+        v = VelocityConfig(
+            kind="gnss_velocity",
+            mount=MountConfig(xyz_m=(4.0, 0.0, 0.0)),
+            stamp_sigma_s=stamp_sigma_s,
+            wander_sigma_mps=0.0,
+        )
+        config = run.config.model_copy(update={"sensors": {"v": v}})
+        found = contradiction(turning, replace(run.recording, measurements=made), config, "v", SENSORS)
+        assert found is not None
+        off_mps = late_s * np.linalg.norm(a_mps2[0])
+        sigma2 = 0.01 + (stamp_sigma_s * np.linalg.norm(a_mps2[0])) ** 2
+        assert found.sigmas == pytest.approx(off_mps / np.sqrt(sigma2 * chi2.median(3)), rel=0.03)
 
 
 def test_effects_and_fits_are_those_of_the_solution(bad: tuple[SimulatedRun, Ablated], whole: Solution) -> None:

@@ -18,7 +18,8 @@ from graphloc.eval.holdout import HoldOut, suggested
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.eval.simulate._voyage import open_motion
 from graphloc.frames import Datum, Geodetic
-from graphloc.measurements import GnssPosition, GnssVelocity, PoseFix
+from graphloc.ledger import Outcome
+from graphloc.measurements import BodyVelocity, GnssPosition, GnssVelocity, PoseFix
 from graphloc.recording import SpeedSeries
 from graphloc.solution import SlowEstimate
 from graphloc.time import stamps_of
@@ -120,6 +121,35 @@ def test_gaps_are_where_they_should_be() -> None:
     assert (inside[0] | inside[1]).all()
     assert abs(inside[0].sum() - 100) <= 2
     assert abs(inside[1].sum() - 100) <= 2
+
+
+def test_a_gap_is_an_outage_of_gnss_and_of_nothing_else() -> None:
+    """A receiver's velocities of the gap's epochs, fused, would leave nothing to drift; wheels go on, and so do velocities beside every n-th fix."""
+    run = simulate(Scenario(duration_s=90.0, imu_hz=10.0, noise="clean"), 0)
+    stamps = [m.stamp_ns for m in run.recording.of(GnssPosition)]
+    zero, unit = np.zeros(3), np.eye(3)
+    beside = [
+        *(
+            GnssVelocity(stamp_ns=s, sensor="v", seq=10**6 + k, v_world_mps=zero, cov_m2ps2=unit)
+            for k, s in enumerate(stamps)
+        ),
+        *(
+            BodyVelocity(stamp_ns=s, sensor="w", seq=10**7 + k, axes=("x",), value=zero[:1], cov=unit[:1, :1])
+            for k, s in enumerate(stamps)
+        ),
+    ]
+    both = tuple(sorted([*run.recording.measurements, *beside], key=lambda m: m.stamp_ns))
+    recording = replace(run.recording, measurements=both)
+    kept, held = HoldOut.parse("gaps:2x10").split(recording)
+    out = {m.stamp_ns for m in held}
+    assert {m.stamp_ns for m in kept.of(GnssVelocity)} == set(stamps) - out
+    assert len(kept.of(BodyVelocity)) == len(stamps)
+    rows = [row for row in kept.rows if row.outcome is Outcome.HELD_OUT]
+    assert sorted(row.stamp_ns for row in rows if row.sensor == "v") == sorted(out)
+    assert len(rows) == 2 * len(held)
+    kept, held = HoldOut.parse("every:5").split(recording)
+    assert held
+    assert len(kept.of(GnssVelocity)) == len(stamps)
 
 
 def test_every_nth_is_the_nth() -> None:

@@ -240,11 +240,13 @@ def test_a_compass_reads_what_a_deviation_table_says() -> None:
         ({}, ("yaw", "B", "C", "D", "E", "wander")),
         ({"wander": 0.0}, ("yaw", "B", "C", "D", "E")),
         ({"deviation": 0.0}, ("yaw", "wander")),
-        ({"mount_offset": 0.0}, ()),
+        ({"mount_offset": 0.0}, ("B", "C", "D", "E", "wander")),
+        ({"mount_offset": 0.0, "deviation": 0.0}, ("wander",)),
+        ({"mount_offset": 0.0, "deviation": 0.0, "wander": 0.0}, ()),
     ],
 )
 def test_a_compass_errs_as_configured(sigmas: dict[str, float], axes: tuple[str, ...]) -> None:
-    """Deviation and wander go with their sigmas, alone, and with the mount's, together; only the wander passes."""
+    """Mount offset, deviation and wander go with their own sigmas; only the wander passes."""
     row = next(r for r in SENSORS if r.kind == "compass")
     config = row.config(kind="compass").model_copy(update={f"{n}_sigma_deg": value for n, value in sigmas.items()})
     assert row.slow is not None

@@ -68,6 +68,15 @@ def test_how_far_a_hole_leads_is_unknown_as_said(rpy: tuple[float, float, float]
     assert there.position() == pytest.approx(np.array([39.0, 0.0, 0.0]), abs=1e-6)
 
 
+def test_how_fast_it_turns_is_known_to_a_sample_and_not_in_a_hole() -> None:
+    """20 mdeg/s/sqrt(Hz) at 100 Hz is 0.2 deg/s of white noise; of 0.2 rad/s/sqrt(Hz) that are forgotten within a second 0.2 rad/s."""
+    links = ROW.link(imu_of(*level(4000), (15.0, 28.0), UPRIGHT), ImuConfig(), UPRIGHT, G, 1.5)
+    at_ns = np.array([5.0, 15.0, 15.01, 20.0, 28.0, 30.005, 40.3, 42.0]) * S
+    sigma_radps = np.sqrt(links.gyro_variance_at(at_ns.astype(np.int64)))
+    white, unknown = 1.5 * np.radians(0.2), 0.2
+    assert sigma_radps == pytest.approx([white, white, unknown, unknown, white, white, white, unknown], rel=1e-6)
+
+
 def test_a_wave_is_not_carried_on() -> None:
     """A hole begins and ends while it rolls at 0.1 rad/s and is pushed by 0.5 m/s^2, of waves of 4 s."""
     t_s = np.arange(4000) / RATE_HZ

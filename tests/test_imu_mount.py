@@ -59,8 +59,9 @@ def askew(run: SimulatedRun, turn_deg: tuple[float, float, float] = ASKEW_DEG) -
 
 
 def gnss_compass(run: SimulatedRun) -> SimulatedRun:
-    """The run with a compass that is known to have no offset; its noise is simulated to 1 deg."""
-    return replace(run, config=changed(run.config, "compass", mount_offset_sigma_deg=0.0))
+    """The run with a compass that is known to have no offset, deviation or wander; its noise is simulated to 1 deg."""
+    exact = {"mount_offset_sigma_deg": 0.0, "deviation_sigma_deg": 0.0, "wander_sigma_deg": 0.0}
+    return replace(run, config=changed(run.config, "compass", **exact))
 
 
 def taken_as_given(run: SimulatedRun) -> SimulatedRun:

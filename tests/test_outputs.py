@@ -47,8 +47,9 @@ def written(out: Path, origin: Geodetic) -> Path:
         accel_bias_mps2=np.zeros((n, 3)),
         gyro_bias_radps=np.zeros((n, 3)),
         gyro_radps=np.tile([0.01, 0.02, 0.03], (n, 1)),
-        health=(Health.GOOD,) * 20 + (Health.DEGRADED,),
-        health_reason=(HealthReason(),) * 20 + (HealthReason("gnss missing", Cause.SENSORS, ("gnss",)),),
+        gyro_cov=np.tile(np.diag([1e-5, 2e-5, 3e-5]), (n, 1, 1)),
+        health=(Health.GOOD,) * 19 + (Health.LOST, Health.DEGRADED),
+        health_reason=(HealthReason(),) * 19 + (HealthReason("nothing", Cause.SENSORS), HealthReason("gnss missing", Cause.SENSORS, ("gnss",)),),
         since_agreed_s={"gnss": np.asarray(np.arange(n) * 0.5, dtype=np.float64)},
         slow={
             "gnss": SlowEstimate(
@@ -125,9 +126,13 @@ def test_tum_keeps_nanoseconds_and_zeros(folder: Path) -> None:
 def test_the_bag_is_as_nav_msgs_has_it(folder: Path) -> None:
     """Pose in the header's frame, twist in the child's."""
     messages: dict[str, Any] = {}
+    status: list[int] = []
     with AnyReader([folder / "solution_bag"]) as reader:
         for connection, stamp, raw in reader.messages():
-            messages.setdefault(connection.topic, (stamp, reader.deserialize(raw, connection.msgtype)))
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            messages.setdefault(connection.topic, (stamp, message))
+            if connection.topic == "/graphloc/fix":
+                status.append(message.status.status)
     stamp, odometry = messages["/graphloc/odometry"]
     assert stamp == START_NS
     assert odometry.header.stamp.sec * 10**9 + odometry.header.stamp.nanosec == START_NS
@@ -136,6 +141,10 @@ def test_the_bag_is_as_nav_msgs_has_it(folder: Path) -> None:
     assert odometry.twist.twist.linear.x == pytest.approx(along)
     assert odometry.twist.twist.angular.z == pytest.approx(0.03)
     np.testing.assert_allclose(np.diagonal(odometry.pose.covariance.reshape(6, 6)), np.diagonal(COV))
+    twist = odometry.twist.covariance.reshape(6, 6)
+    np.testing.assert_allclose(np.diagonal(twist)[3:], [1e-5, 2e-5, 3e-5])  # zeros there say that the rate is exact
+    assert np.trace(twist[:3, :3]) == pytest.approx(0.01 + 0.02 + 0.03)
+    assert status == [0] * 19 + [-1, 0]
     _, fix = messages["/graphloc/fix"]
     assert fix.latitude == pytest.approx(57.7 - 40.0 / 111_400.0, abs=1e-5)
     assert fix.position_covariance[4] == pytest.approx(0.09)

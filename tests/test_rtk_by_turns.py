@@ -14,7 +14,7 @@ import pytest
 
 from graphloc import app
 from graphloc.build import shared_constants
-from graphloc.config import GnssConfig, SensorConfig, SlowErrorConfig, VesselConfig
+from graphloc.config import GnssConfig, SensorConfig, SlowErrorConfig, VelocityConfig, VesselConfig
 from graphloc.eval.drill import script
 from graphloc.eval.ekf import run_honest
 from graphloc.eval.holdout import HoldOut, telling
@@ -194,6 +194,15 @@ def test_held_out_fixes_without_rtk_measure_nothing() -> None:
     assert {m.sensor for m in found.held} == {"gnss"}
     assert len(found.held) == held.count("gnss")
     assert f"Another {held.count('gnss_other')} without RTK were kept out" in app.report_data(found).truth_statement
+    row = replace(found.recording.rows[-1], sensor="velocity", outcome=Outcome.HELD_OUT)  # of a gap
+    beside = replace(
+        found,
+        recording=replace(found.recording, rows=(*found.recording.rows, row, row)),
+        config=found.config.with_sensors({"velocity": VelocityConfig(topic="/v")}),
+    )
+    said = app.report_data(beside).truth_statement
+    assert f"Another {held.count('gnss_other')} without RTK were kept out" in said
+    assert "The 2 GNSS velocities in the gaps were kept out" in said
     without = two.recording.where(lambda m: m.sensor != "gnss")
     _, left = HoldOut(every=5).split(without)
     assert telling(left, two.config) == left  # where there is nothing better

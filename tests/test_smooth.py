@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from graphloc import app
 from graphloc.config import VesselConfig
@@ -82,6 +83,21 @@ def test_the_gnss_error_is_found_with_its_sign(short: app.Run) -> None:
     estimated = np.column_stack([np.interp(at.stamps_ns, slow.stamps_ns, slow.value[:, k]) for k in range(2)])
     assert np.sqrt((error[:, :2] ** 2).mean()) > 0.5
     assert np.sqrt(((estimated - error[:, :2]) ** 2).mean()) < 0.35  # 0.21 m of it is each fix's white noise
+
+
+def test_how_fast_it_turns_is_as_uncertain_as_said(short: app.Run) -> None:
+    """8 mdeg/s/sqrt(Hz) at 50 Hz is 0.06 deg/s, and less between two samples; the bias is known to less."""
+    solution, truth = short.solution, short.recording.truth
+    assert truth is not None
+    track = solution.trajectory.where(slice(2, -2))
+    R = [truth.at(track.stamps_ns + half_ns).R_world_body for half_ns in (-10_000_000, 10_000_000)]
+    true_radps = Rotation.from_matrix(np.swapaxes(R[0], 1, 2) @ R[1]).as_rotvec() / 0.02
+    off, cov = solution.gyro_radps[2:-2] - true_radps, solution.gyro_cov[2:-2]
+    nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv(cov), off).mean()
+    assert 1.2 < nees < 3.6
+    assert short.config.sensors["imu"].gyro_noise_mdps_per_sqrt_hz == 8.0
+    white = np.radians(0.008) ** 2 * 50.0
+    assert (np.linalg.eigvalsh(cov)[:, 0] > white).all()  # the bias's is added
 
 
 def test_modes_are_chosen() -> None:

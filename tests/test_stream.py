@@ -338,7 +338,7 @@ def estimate(stamp_ns: int = 1_700_000_000_000_000_007) -> Estimate:
     return Estimate(
         stamp_ns=stamp_ns, p_world_m=np.array([10.0, 0.0, 2.0]), R_world_body=left, v_world_mps=np.array([0.0, 1.5, 0.0]),
         cov=np.diag([4.0, 1.0, 1.0, 0.01, 0.01, 0.0004]), v_cov=np.eye(3), p_odom_m=np.array([1.0, 0.0, 0.0]), R_odom_body=np.eye(3),
-        step_cov=np.eye(6), gyro_radps=np.array([0.0, 0.0, 0.1]), accel_bias_mps2=np.zeros(3), gyro_bias_radps=np.zeros(3),
+        step_cov=np.eye(6), gyro_radps=np.array([0.0, 0.0, 0.1]), gyro_cov=np.diag([1e-5, 2e-5, 3e-5]), accel_bias_mps2=np.zeros(3), gyro_bias_radps=np.zeros(3),
         health=Health.DEGRADED, reason=HealthReason("no match yet", Cause.SENSORS), since_agreed_s={"gnss": 0.5, "match": float("inf")},
     )  # fmt: skip
 

@@ -126,9 +126,8 @@ def test_a_compass_that_wanders_is_told_by_the_gyroscope(run: SimulatedRun) -> N
     (line,) = wander_warning(imu, "compass", wandering(headings, 3.0, 100.0), CompassConfig())
     assert f"wanders by {found:.1f} deg" in line
     assert wander_warning(imu, "compass", wandering(headings, 3.0, 100.0), CompassConfig(wander_sigma_deg=2.0)) == []
-    assert (
-        wander_warning(imu, "compass", wandering(headings, 3.0, 100.0), CompassConfig(mount_offset_sigma_deg=0.0)) == []
-    )
+    calibrated = CompassConfig(mount_offset_sigma_deg=0.0)
+    assert wander_warning(imu, "compass", wandering(headings, 3.0, 100.0), calibrated) == [line]
 
 
 def test_most_of_a_wander_is_told_in_a_short_run(run: SimulatedRun) -> None:

@@ -63,12 +63,16 @@ def truth_statement(run: Run) -> str:
         started = " The EKFs are started at it, as BL started theirs; graphloc is not." if begun else ""
         return f"Truth: {named}, {len(truth)} poses over {span_s:.0f} s; it was not fused.{started}"
     if run.held:
-        left = sum(row.outcome is Outcome.HELD_OUT for row in run.recording.rows) - len(run.held)
+        sensors = [row.sensor for row in run.recording.rows if row.outcome is Outcome.HELD_OUT]
+        velocities = sum(name in run.config.of_kind("gnss_velocity") for name in sensors)
+        left = len(sensors) - velocities - len(run.held)
         beside = (
             f" Another {left} without RTK were kept out as well; they tell less, as they are off by more."
             if left
             else ""
         )
+        if velocities:
+            beside += f" The {velocities} GNSS velocities in the gaps were kept out, too, as in an outage."
         return (
             f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; their own noise is part "
             f"of the error.{beside} The track in this folder lacks them: for the best track run again without --hold-out."

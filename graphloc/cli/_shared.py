@@ -39,7 +39,11 @@ DurationOption = Annotated[
 ConfigOption = Annotated[Path, typer.Option("--config", "-c", help="The vessel.yaml.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")]
 HoldOutOption = Annotated[
-    str | None, typer.Option("--hold-out", help="Withhold GNSS fixes and predict them: every:N or gaps:COUNTxSECONDS.")
+    str | None,
+    typer.Option(
+        "--hold-out",
+        help="Withhold GNSS fixes and predict them: every:N, or gaps:COUNTxSECONDS, which lack GNSS velocities, too.",
+    ),
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output.")]
 FiguresOption = Annotated[bool, typer.Option("--figures", help="Also write the figures as PNG and SVG.")]

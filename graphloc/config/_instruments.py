@@ -181,12 +181,13 @@ class CompassConfig(SensorConfig):
     use_reported_sigma: bool = True
     """Use the yaw variance of an `Imu` message, or the accuracy in a maker's message, if it is positive and finite."""
     mount_offset_sigma_deg: NonNegative = 1.0
-    """Unknown constant heading offset of the mount, 1 sigma, deg. 0: no offset, and neither deviation nor wander."""
+    """Unknown constant heading offset of the mount, 1 sigma, deg. 0: it was calibrated; iron turns the compass nevertheless (below)."""
     deviation_sigma_deg: NonNegative = 1.5
     """Magnetic deviation: coefficients B and C (sine and cosine of the heading), 1 sigma, deg; D and E (twice the
     heading) get half of it. 0: none, e.g. a GNSS compass."""
     wander_sigma_deg: NonNegative = 0.5
-    """Temporary heading error (a crane or quay nearby, the compass's own filter), 1 sigma, deg."""
+    """Temporary heading error (a crane or quay nearby, the compass's own filter), 1 sigma, deg. A GNSS compass: 0.2. 0: none; a heading
+    is trusted as it is, its noise aside, where all three are 0."""
     wander_time_constant_s: Positive = 60.0
     """Correlation time of that error, s."""
     nmea: Headings = ("HDT", "THS")

@@ -51,7 +51,9 @@ def estimate_of(
     newest, problem = lag.newest, lag.problem
     at_ns, lever = now.stamp_ns, -problem.t_body_imu_m
     R = now.pose.rotation().matrix()
-    gyro = problem.links.gyro_at(np.array([at_ns]))[0] - problem.R_body_imu @ newest.bias.gyroscope()
+    at, R_body_imu = np.array([at_ns]), problem.R_body_imu
+    gyro = problem.links.gyro_at(at)[0] - R_body_imu @ newest.bias.gyroscope()
+    white = problem.links.gyro_variance_at(at)[0] * np.eye(3)
     cov, v_cov = _covariances(now, lag, R, unmodelled)
     others_m, others_cov = lag.others
     cov[:3, :3] += others_cov + lag.contradicted
@@ -75,6 +77,7 @@ def estimate_of(
         R_odom_body=np.array(now.R_odom_body),
         step_cov=odometry.step_cov,
         gyro_radps=gyro,
+        gyro_cov=white + R_body_imu @ newest.gyro_bias_cov @ R_body_imu.T,
         accel_bias_mps2=np.asarray(newest.bias.accelerometer()),
         gyro_bias_radps=np.asarray(newest.bias.gyroscope()),
         health=health,

@@ -156,6 +156,7 @@ def _own(leg: Solution, begin_ns: int, end_ns: int, before: Solution | None) -> 
         accel_bias_mps2=leg.accel_bias_mps2[own],
         gyro_bias_radps=leg.gyro_bias_radps[own],
         gyro_radps=leg.gyro_radps[own],
+        gyro_cov=leg.gyro_cov[own],
         health=tuple(h for h, m in zip(leg.health, own, strict=True) if m),
         health_reason=tuple(h for h, m in zip(leg.health_reason, own, strict=True) if m),
         since_agreed_s=since,

@@ -132,6 +132,7 @@ def _join(solutions: Sequence[Solution], rows: Sequence[LedgerRow], warnings: Se
         accel_bias_mps2=np.concatenate([s.accel_bias_mps2 for s in solutions]),
         gyro_bias_radps=np.concatenate([s.gyro_bias_radps for s in solutions]),
         gyro_radps=np.concatenate([s.gyro_radps for s in solutions]),
+        gyro_cov=np.concatenate([s.gyro_cov for s in solutions]),
         health=tuple(h for s in solutions for h in s.health),
         health_reason=tuple(r for s in solutions for r in s.health_reason),
         since_agreed_s=since,

@@ -52,6 +52,7 @@ class _States(NamedTuple):
     accel_bias_mps2: Array
     gyro_bias_radps: Array
     gyro_radps: Array
+    gyro_cov: Array
 
 
 def make_solution(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
@@ -79,6 +80,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
         accel_bias_mps2=states.accel_bias_mps2,
         gyro_bias_radps=states.gyro_bias_radps,
         gyro_radps=states.gyro_radps,
+        gyro_cov=states.gyro_cov,
         health=health,
         health_reason=reasons,
         since_agreed_s=since,
@@ -103,8 +105,11 @@ def _states_of(problem: Problem, result: BatchResult) -> _States:
     R = np.array([p.rotation().matrix() for p in poses])
     bias = [values.atConstantBias(keys.bias(int(j))) for j in problem.timeline.slow_of]
     gyro_bias = np.array([b.gyroscope() for b in bias])
-    raw = result.problem.links.gyro_at(problem.timeline.stamps_ns)
-    gyro = raw - gyro_bias @ result.problem.R_body_imu.T
+    links, R_body_imu = result.problem.links, result.problem.R_body_imu
+    gyro = links.gyro_at(problem.timeline.stamps_ns) - gyro_bias @ R_body_imu.T
+    nodes = range(len(problem.timeline.slow_stamps_ns))
+    bias_cov = np.array([R_body_imu @ result.cov[keys.bias(j)][3:, 3:] @ R_body_imu.T for j in nodes])
+    white = links.gyro_variance_at(problem.timeline.stamps_ns)[:, None, None] * np.eye(3)
     lever = -problem.t_body_imu_m
     cov = np.array([world_covariance(result.cov[keys.pose(k)], R[k], lever) for k in states])
     cov[:, :3, :3] += unmodelled_covariance(problem.streams) + result.levels_cov
@@ -122,6 +127,7 @@ def _states_of(problem: Problem, result: BatchResult) -> _States:
         accel_bias_mps2=np.array([b.accelerometer() for b in bias]),
         gyro_bias_radps=gyro_bias,
         gyro_radps=gyro,
+        gyro_cov=white + bias_cov[problem.timeline.slow_of],
     )
 
 
