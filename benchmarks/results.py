@@ -32,6 +32,7 @@ import online
 import online_faults
 import simulator
 import single_tags
+import slow_filter
 import smoothing
 import soak
 import sweep
@@ -72,6 +73,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "E.6": online.odometry,
     "E.day": soak.day,
     "E.dark": dead_reckoning.figures,
+    "E.ekf": slow_filter.figures,
     "E.imu": wrong_imu.figures,
     "F.3": batch.figures,
     "F.3p": where.figures,

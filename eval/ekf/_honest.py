@@ -43,6 +43,11 @@ class _HonestEkf:
         return np.append(x, 0.0), np.diag([1.0, 1.0, 1.0, 1.0, np.radians(5.0) ** 2, np.radians(0.5) ** 2])
 
     def predict(self, x: Array, P: Array, step: Interval) -> tuple[Array, Array]:
+        x, F, Q = self.moved(x, step)
+        return x, F @ P @ F.T + Q
+
+    def moved(self, x: Array, step: Interval) -> tuple[Array, Array, Array]:
+        """Return the state (6,) one step later, F (6, 6) and the noise that comes to it."""
         # In a turn the body's axes rotate under its velocity: dv/dt = a - w x v, which the print leaves out.
         rate = self._rate = step.rate - x[5]
         turning = rate * np.array([x[3], -x[2]])
@@ -51,10 +56,10 @@ class _HonestEkf:
         F[:5, :5] = transition(x[:5], _DT_S, exact=True)
         F[2, 3], F[3, 2], F[2, 5], F[3, 5] = _DT_S * rate, -_DT_S * rate, -_DT_S * x[3], _DT_S * x[2]
         F[4, 5] = -_DT_S
-        P = F @ P @ F.T + self._Q
+        Q = self._Q.copy()
         if step.silent:
-            P[:5, :5] += SILENT_Q * _DT_S
-        return np.append(advance(x[:5], step.accel + turning - bias, rate, _DT_S), x[5]), P
+            Q[:5, :5] += SILENT_Q * _DT_S
+        return np.append(advance(x[:5], step.accel + turning - bias, rate, _DT_S), x[5]), F, Q
 
     def gate(self, m: Measurement, r: Array, H: Array, P: Array, R: Array) -> Array | str:
         R = R + self._slow(m, len(R))
