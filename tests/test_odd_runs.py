@@ -263,6 +263,8 @@ def test_where_nothing_measures_position_no_datum_is_asked_for() -> None:
     recording = Recording(source="my.bag", imu=None, measurements=())
     with pytest.raises(InputError, match="nor another that measures position"):
         app.choose_datum(recording, VesselConfig(sensors={"height": HeightConfig()}))
+    with pytest.raises(InputError, match="and mocap is switched off; switch it on"):
+        app.choose_datum(recording, VesselConfig(sensors={"mocap": PoseConfig(topic="/hall", enabled=False)}))
     with pytest.raises(InputError, match="set datum:"):
         app.choose_datum(recording, VesselConfig(sensors={"matches": PoseConfig(topic="/pose")}))
 
