@@ -166,6 +166,16 @@ def windows_of(motion: MeasuredMotion) -> tuple[float, ...]:
     return tuple(half_s for half_s in HALF_S if half_s >= _NEARLY * apart_s) or (apart_s,)
 
 
+def unbroken(times_s: Array, middle_s: Array, half_s: float) -> NDArray[np.bool_]:
+    """Return of which windows (N,) no part lies in a gap of the measurements that is longer than `windows_of` would have it.
+
+    Across a tunnel a straight line tells nothing of how the craft moved, and as it changes at both ends it fits some motion at some lag.
+    """
+    gap = np.flatnonzero(np.diff(times_s) * _NEARLY > half_s)
+    begins, ends = np.append(times_s[gap], np.inf), np.append(times_s[gap + 1], np.inf)
+    return np.asarray(begins[np.searchsorted(ends, middle_s - half_s, side="right")] >= middle_s + half_s)
+
+
 def _yaw_by(felt: Felt, motion: MeasuredMotion, half_s: float) -> YawInCraft | None:
     """Return the estimate by one motion and one window length.
 
@@ -178,7 +188,7 @@ def _yaw_by(felt: Felt, motion: MeasuredMotion, half_s: float) -> YawInCraft | N
     middle = np.arange(max(t[0], at[0]) + half_s, min(t[-1], at[-1]) - half_s, STEP_S)
     (moved, chord), (f, _) = bent(at, way, middle, half_s), bent(t, felt.way_m, middle, half_s)
     faced = np.exp(1j * np.interp(middle, t, felt.turned))
-    good = np.abs(chord) > MOVES_M if motion.attitude is None else np.full(len(middle), True)
+    good = unbroken(at, middle, half_s) & (motion.attitude is not None or np.abs(chord) > MOVES_M)
     windows = good.sum() * STEP_S / half_s
     if windows < FEWEST:
         return None
