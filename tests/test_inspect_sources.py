@@ -938,7 +938,7 @@ def test_fixes_that_are_stamped_late_get_an_offset(late_s: float, tmp_path: Path
     assert config.sensors["gnss"].stamp_sigma_s >= 0.05  # what is left is estimated with the run
 
 
-def in_a_hall(make: Messages, yaw_deg: float, of: Callable[[int, Array, Array], Any]) -> list[Item]:
+def in_a_hall(make: Messages, yaw_deg: float, of: Callable[[int, list[float], list[float]], Any]) -> list[Item]:
     """A multirotor that leans into its accelerations for 60 s, so that it feels none along its deck; its IMU's x looks up.
 
     Args:
@@ -961,7 +961,7 @@ def in_a_hall(make: Messages, yaw_deg: float, of: Callable[[int, Array, Array], 
         at = START_NS + k * S // 50
         items.append(("/imu", at, make.imu(at, M.T @ felt[k], M.T @ rate[k])))
         if k % 2 == 0:
-            items.append(("/hall/craft", at, of(at, place[k], R[k].as_quat())))
+            items.append(("/hall/craft", at, of(at, place[k].tolist(), R[k].as_quat().tolist())))
     return items
 
 
@@ -983,14 +983,14 @@ def test_motion_capture_alone_tells_the_place_and_how_the_imu_sits(yaw_deg: floa
     (tmp_path / "told.yaml").write_text(told)
     sensor = load_config(tmp_path / "told.yaml", KINDS).sensors["pose"]
     assert sensor.enabled
-    assert sensor.axes == ("x", "y", "z", "yaw")  # type: ignore[union-attr]
+    assert sensor.axes == ("x", "y", "z", "yaw")
 
 
 def test_points_alone_tell_the_place_without_a_heading(tmp_path: Path) -> None:
     make = Messages(2)
     found, config, _ = look(tmp_path, in_a_hall(make, 0.0, lambda at, p, _: make.point(at, p)), make)
     assert any("nothing but poses tells the place" in w for w in found.warnings)
-    assert config.sensors["pose"].axes == ("x", "y", "z")  # type: ignore[union-attr]
+    assert config.sensors["pose"].axes == ("x", "y", "z")
 
 
 @pytest.mark.parametrize("heading", ["late, hardly turning", "in time, turning"])
