@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from graphloc.config import GnssConfig, SlowErrorConfig
 from graphloc.frames import Array, Datum, Geodetic
@@ -19,7 +20,7 @@ from graphloc.frontends._fixes import RTK_SIGMA_M, radians_warning, scatter_m, s
 from graphloc.frontends._reports import GnssReport, PartOfFixes, TopicReport, Vec, of_nmea
 from graphloc.frontends._sanity import far_fixes_of
 from graphloc.frontends._streams import TopicData
-from graphloc.frontends.decode import IMU, PLAIN_POSE, POSE, UNSTAMPED
+from graphloc.frontends.decode import IMU, PLACES, UNSTAMPED
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.signals.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.signals.white_noise import white_noise
@@ -34,7 +35,8 @@ STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
 class MeasuredMotion:
     """How the craft moved: times (N,) s since `origin_ns`, speed (N,) m/s (signed where the source knows).
 
-    `way_m`: (N,) its places, m, east + i north, about any origin; None where the source tells the speed only.
+    `way_m`: (N,) its places, m, east + i north, about any origin; None where the source tells the speed only. `attitude`: N rotations to
+    the world from the craft's axes, where the source tells them, too.
     `rests`: whether its speed is precise enough to tell that the craft stands.
     """
 
@@ -44,6 +46,7 @@ class MeasuredMotion:
     speed_mps: Array
     way_m: NDArray[np.complex128] | None = None
     rests: bool = True
+    attitude: Rotation | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,7 +144,7 @@ def on_one_clock(streams: Sequence[TopicData]) -> list[TopicData]:
     found = []
     for stream in streams:
         behind = _clock.behind_s(clocks[stream.topic], imu, reference)
-        limit = _clock.JUMP_LIMIT_S if stream.msgtype in (POSE, PLAIN_POSE) else _clock.EPOCH_LIMIT_S
+        limit = _clock.JUMP_LIMIT_S if stream.msgtype in PLACES else _clock.EPOCH_LIMIT_S
         found.append(stream.later(round(behind * NS_PER_S)) if abs(behind) > limit else stream)
     return found
 

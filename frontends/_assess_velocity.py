@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation
 from graphloc.frontends._assess import MeasuredMotion, motion_of_places, sane, track, vec
@@ -25,7 +27,7 @@ from graphloc.frontends._reports import (
 )
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import Pose
-from graphloc.frontends.decode import ODOMETRY, VECTOR
+from graphloc.frontends.decode import ODOMETRY, POINT, VECTOR
 from graphloc.signals.series import integral, interpolated
 from graphloc.time import NS_PER_S
 
@@ -206,7 +208,7 @@ def odometry_report(
     rows = stream.rows[sane(stream)]
     speed = float(np.nanmax(np.abs(rows[:, 7]))) if len(rows) and np.isfinite(rows[:, 7]).any() else 0.0
     name, reverse, fused = stream.topic.lower(), False, _fused(stream.topic, world)
-    truth = any(word in name for word in ("truth", "groundtruth", "/gt"))
+    truth = stream.msgtype != POINT and any(word in name for word in ("truth", "groundtruth", "/gt"))
     if truth:
         role, why = "truth", "its name says so"
     elif stream.msgtype != ODOMETRY or speed <= 0.05:
@@ -277,6 +279,19 @@ def motions_of(
             (found if report.mount is None or log is not None else logs).append(motion)
     ways = [(s, *_as_good_as_most(*track(s))) for s in fixes]
     return found + [m for s, at, p in ways if (m := motion_of_places(s.topic, at, p))] or logs
+
+
+def motion_of_poses(poses: TopicData) -> MeasuredMotion | None:
+    """Return the motion that poses tell, with their attitude, if they have one; None of few."""
+    keep = sane(poses, np.s_[:3])
+    q = poses.rows[keep, 3:7]
+    whole = np.isfinite(q).all(axis=1) & (np.abs(np.linalg.norm(q, axis=1) - 1.0) < 0.1)
+    told = bool(whole.mean() > 0.5) if len(whole) else False
+    keep = keep[whole] if told else keep
+    motion = motion_of_places(poses.topic, poses.stamps_ns[keep], poses.rows[keep, :3])
+    if motion is None or not told:
+        return motion
+    return replace(motion, attitude=Rotation.from_quat(q[whole]))
 
 
 def _as_good_as_most(stamps_ns: NDArray[np.int64], p_m: Array, rows: Array) -> tuple[NDArray[np.int64], Array]:

@@ -34,7 +34,7 @@ from graphloc.frontends._reports import (
 )
 from graphloc.frontends._streams import COURSE, HEADING
 from graphloc.frontends._turns import WANDERS_DEG
-from graphloc.frontends.decode import IMU, VECTOR
+from graphloc.frontends.decode import IMU, POINT, VECTOR
 
 _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
 # Wander of a compass from which it is drafted, and times what is usual: the comparison itself shows 0.6 deg in heavy waves.
@@ -106,11 +106,14 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         ]
     yield from (_wheels_block(_numbered("wheels", k), item) for k, item in enumerate(wheels))
     for k, item in enumerate(o for o in inspection.odometry if o.role == "pose"):
+        measured = "x, y, z" if item.msgtype == POINT else "x, y, z, yaw"
+        axes = [f"  axes: [{measured}]"] if item.msgtype == POINT or not (inspection.gnss or in_a_grid) else []
         yield [
             f"{_numbered('pose', k)}:",
             "  kind: pose",
             f"  topic: {item.topic}",
             f"  # its frame '{item.frame_id}': {item.world}",
+            *axes,
             "  enabled: false  # guess: true if its frame is east-north-up at the datum and no fix went into it",
             "  # slow_error: {sigma_m: 1.0, time_constant_s: 60}  # where errors last (USBL, UWB, a filter's output); else they count as independent",
         ]
@@ -127,7 +130,7 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
         yield [f"# {other.topic}: left out; {other.left_out}"]
     fixes, poses = inspection.gnss or in_a_grid, any(item.role == "pose" for item in inspection.odometry)
     if fixes or poses or lidars:
-        alone = "" if fixes else "; nothing else tells the height, unless z of a pose is used (axes)"
+        alone = "" if fixes or poses else "; nothing else tells the height"
         yield ["height:", f"  enabled: false  # guess: true for a vessel that floats{alone}"]
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
+from scipy.spatial.transform import Slerp
 
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import MeasuredMotion
@@ -22,6 +23,7 @@ from graphloc.time import NS_PER_S
 
 # Half the time over which an acceleration is asked: short, a car's fits best; longer, waves and the noise of fixes are less.
 HALF_S = (0.5, 1.0, 2.0, 4.0)
+_TIPS_S = 0.25  # half the time over which a roll or pitch is asked
 STEP_S = 0.5  # between two times at which it is asked
 FEWEST, MOVES_M = 20, 1.0  # windows; a shorter way has no direction
 _MIN_COHERENCE, _CLEAR = 0.25, 4.0  # and so many times what chance gives
@@ -143,7 +145,10 @@ def yaw_in_craft(
         stamps_ns: (N,), increasing. accel, gyro: (N, 3) m/s^2, rad/s, levelled.
     """
     felt = Felt.of(stamps_ns, accel, gyro)
-    tried = [found for motion in motions for half_s in windows_of(motion) if (found := _yaw_by(felt, motion, half_s))]
+    tipped = [found for motion in motions if (found := _yaw_by_tipping(felt, gyro, motion)) and found.clear]
+    tried = tipped or [
+        found for motion in motions for half_s in windows_of(motion) if (found := _yaw_by(felt, motion, half_s))
+    ]
     if not tried:
         return None
     best = max(tried, key=lambda found: found.coherence / found.chance)
@@ -161,11 +166,21 @@ def windows_of(motion: MeasuredMotion) -> tuple[float, ...]:
     return tuple(half_s for half_s in HALF_S if half_s >= _NEARLY * apart_s) or (apart_s,)
 
 
+def unbroken(times_s: Array, middle_s: Array, half_s: float) -> NDArray[np.bool_]:
+    """Return of which windows (N,) no part lies in a gap of the measurements that is longer than `windows_of` would have it.
+
+    Across a tunnel a straight line tells nothing of how the craft moved, and as it changes at both ends it fits some motion at some lag.
+    """
+    gap = np.flatnonzero(np.diff(times_s) * _NEARLY > half_s)
+    begins, ends = np.append(times_s[gap], np.inf), np.append(times_s[gap + 1], np.inf)
+    return np.asarray(begins[np.searchsorted(ends, middle_s - half_s, side="right")] >= middle_s + half_s)
+
+
 def _yaw_by(felt: Felt, motion: MeasuredMotion, half_s: float) -> YawInCraft | None:
     """Return the estimate by one motion and one window length.
 
     Of positions p, p(t + h) - 2 p(t) + p(t - h) gives the mean acceleration about t, and p(t + h) - p(t - h) the course; the
-    sensor gives the same in its own axes at t. h: `half_s`.
+    sensor gives the same in its own axes at t. h: `half_s`. Poses tell where the craft heads, whatever its course.
     """
     t, at = felt.t_s, felt.times_of(motion)
     there = np.interp(at, t, felt.turned)
@@ -173,18 +188,43 @@ def _yaw_by(felt: Felt, motion: MeasuredMotion, half_s: float) -> YawInCraft | N
     middle = np.arange(max(t[0], at[0]) + half_s, min(t[-1], at[-1]) - half_s, STEP_S)
     (moved, chord), (f, _) = bent(at, way, middle, half_s), bent(t, felt.way_m, middle, half_s)
     faced = np.exp(1j * np.interp(middle, t, felt.turned))
-    good = np.abs(chord) > MOVES_M
+    good = unbroken(at, middle, half_s) & (motion.attitude is not None or np.abs(chord) > MOVES_M)
     windows = good.sum() * STEP_S / half_s
     if windows < FEWEST:
         return None
-    heads = faced if motion.way_m is None else chord / np.maximum(np.abs(chord), MOVES_M)
+    if motion.attitude is not None:
+        heads = np.exp(1j * np.interp(middle, at, np.unwrap(motion.attitude.as_euler("ZYX")[:, 0])))
+    else:
+        heads = faced if motion.way_m is None else chord / np.maximum(np.abs(chord), MOVES_M)
     m, f = (moved * np.conj(heads))[good], (f * np.conj(faced))[good]
+    return _turn_between(motion.source, f, m, windows)
+
+
+def _yaw_by_tipping(felt: Felt, gyro: Array, motion: MeasuredMotion) -> YawInCraft | None:
+    """Return the estimate by how the craft rolls and pitches, by its attitude and by the gyroscope (N, 3), levelled; None of too few.
+
+    A multirotor leans into its accelerations, so that it feels none along its deck: only its rates tell how a sensor sits.
+    """
+    t, at = felt.t_s, felt.times_of(motion)
+    middle = np.arange(max(t[0], at[0]) + _TIPS_S, min(t[-1], at[-1]) - _TIPS_S, 2.0 * _TIPS_S)
+    if motion.attitude is None or len(middle) < FEWEST:
+        return None
+    attitude = Slerp(at, motion.attitude)
+    before, after = (attitude(np.clip(middle + h, at[0], at[-1])) for h in (-_TIPS_S, _TIPS_S))
+    theirs = (before.inv() * after).as_rotvec()
+    tips = integral(t, gyro[:, 0] + 1j * gyro[:, 1])
+    ours = np.interp(middle + _TIPS_S, t, tips) - np.interp(middle - _TIPS_S, t, tips)
+    return _turn_between(motion.source, ours, theirs[:, 0] + 1j * theirs[:, 1], float(len(middle)))
+
+
+def _turn_between(source: str, f: NDArray[np.complex128], m: NDArray[np.complex128], windows: float) -> YawInCraft:
+    """Return the turn from what the craft did, m, to what the sensor felt, f, in its own axes, by so many independent windows."""
     m, f = m - m.mean(), f - f.mean()
     power = float(np.sqrt((np.abs(f) ** 2).sum() * (np.abs(m) ** 2).sum()))
     product = complex((np.conj(f) * m).sum())
     coherence = abs(product) / power if power > 0.0 else 0.0
     psi = float(np.degrees(np.angle(product)))
-    return YawInCraft(motion.source, psi, max(coherence, 1e-6), 1.0 / float(np.sqrt(windows)))
+    return YawInCraft(source, psi, max(coherence, 1e-6), 1.0 / float(np.sqrt(windows)))
 
 
 def bent(

@@ -28,9 +28,8 @@ from graphloc.frontends.decode import (
     NMEA_STATUS,
     NUMBERS,
     ODOMETRY,
-    PLAIN_POSE,
+    PLACES,
     PLAIN_TWIST,
-    POSE,
     QUATERNION,
     TWIST,
     UNSTAMPED,
@@ -38,6 +37,7 @@ from graphloc.frontends.decode import (
     gps_fix_velocity_mps,
     nav_sat_status,
     nmea_sigmas_m,
+    pose_numbers,
     stamp_ns_of,
 )
 from graphloc.frontends.source import TF_MOVING, TF_STATIC, Bag, RawMessage
@@ -68,8 +68,7 @@ def _fix_row(m: Any) -> tuple[float, ...]:
 
 
 def _pose_row(m: Any) -> tuple[float, ...]:
-    pose = getattr(m.pose, "pose", m.pose)
-    return (*_xyz(pose.position), *_xyzw(pose.orientation), 0.0, 0.0, 0.0)
+    return (*pose_numbers(m), 0.0, 0.0, 0.0)
 
 
 def _odometry_row(m: Any) -> tuple[float, ...]:
@@ -81,12 +80,11 @@ ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
     NAV_SAT_FIX: _fix_row,
     QUATERNION: lambda m: _xyzw(m.quaternion),
     ODOMETRY: _odometry_row,
-    POSE: _pose_row,
+    **dict.fromkeys(PLACES, _pose_row),
     TWIST: lambda m: _xyz(m.twist.twist.linear),
     PLAIN_TWIST: lambda m: _xyz(m.twist.linear),
     VECTOR: lambda m: _xyz(m.vector),
     **dict.fromkeys(GPS_FIXES, _fix_row),
-    PLAIN_POSE: _pose_row,
     **dict.fromkeys(NUMBERS, lambda m: (m.data,)),
 }
 # Places that no sensor of the craft says: wanted ones, the origin of a filter, other vessels, the truth.

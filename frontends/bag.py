@@ -52,8 +52,7 @@ from graphloc.frontends._turns import Yaws, pose_turn_warning, refuse_unit, scal
 from graphloc.frontends.decode import (
     NMEA,
     ODOMETRY,
-    PLAIN_POSE,
-    POSE,
+    TRUE_TYPES,
     UNSTAMPED,
     Decoded,
     stamp_ns_of,
@@ -283,7 +282,7 @@ def _reference(
 ) -> Reference | None:
     if topic is None:
         return None
-    _check_topic(topic, key, (ODOMETRY, POSE, PLAIN_POSE) if key == "truth_topic" else (ODOMETRY,), topics, bag)
+    _check_topic(topic, key, TRUE_TYPES if key == "truth_topic" else (ODOMETRY,), topics, bag)
     return Reference(topic, reason)
 
 

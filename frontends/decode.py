@@ -56,6 +56,11 @@ TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
 PLAIN_TWIST = "geometry_msgs/msg/TwistStamped"
 VECTOR = "geometry_msgs/msg/Vector3Stamped"
 PLAIN_POSE = "geometry_msgs/msg/PoseStamped"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"  # of motion capture
+POINT = "geometry_msgs/msg/PointStamped"  # of a total station, or UWB
+PLACES = (POSE, PLAIN_POSE, TRANSFORM, POINT)
+POSE_TYPES = (ODOMETRY, *PLACES)
+TRUE_TYPES = tuple(t for t in POSE_TYPES if t != POINT)
 GPS_FIXES = ("gps_msgs/msg/GPSFix", "gps_common/msg/GPSFix")
 NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
 _STRING = "std_msgs/msg/String"
@@ -478,22 +483,35 @@ def is_unit(quaternion: Array) -> bool:
 
 
 def pose_of(msg: Any) -> tuple[Array, Array | None]:
-    """Return position (3,) and rotation (3, 3) of an Odometry, PoseWithCovarianceStamped or PoseStamped message.
+    """Return position (3,) and rotation (3, 3) of an Odometry, PoseWithCovarianceStamped, PoseStamped, TransformStamped or PointStamped message.
 
-    The rotation is None if the quaternion is invalid.
+    The rotation is None if the quaternion is invalid, or the message has none.
     """
-    pose = getattr(msg.pose, "pose", msg.pose)
-    p, q = pose.position, pose.orientation
-    position = np.array([p.x, p.y, p.z], dtype=float)
-    quaternion = np.array([q.x, q.y, q.z, q.w], dtype=float)
-    return position, np.asarray(Rotation.from_quat(quaternion).as_matrix()) if is_unit(quaternion) else None
+    *place, x, y, z, w = pose_numbers(msg)
+    quaternion = np.array([x, y, z, w])
+    return np.array(place), np.asarray(Rotation.from_quat(quaternion).as_matrix()) if is_unit(quaternion) else None
+
+
+def pose_numbers(msg: Any) -> tuple[float, ...]:
+    """Return x, y, z, and x, y, z, w of the quaternion, of a message as `pose_of` takes; NaN where it has no orientation."""
+    if hasattr(msg, "transform"):
+        p, q = msg.transform.translation, msg.transform.rotation
+    elif hasattr(msg, "point"):
+        return float(msg.point.x), float(msg.point.y), float(msg.point.z), *(np.nan,) * 4
+    else:
+        pose = getattr(msg.pose, "pose", msg.pose)
+        p, q = pose.position, pose.orientation
+    return float(p.x), float(p.y), float(p.z), float(q.x), float(q.y), float(q.z), float(q.w)
 
 
 def _pose(msg: Any, stamp_ns: int, seq: int, sensor: str, config: PoseConfig) -> Decoded:
     position, rotation = pose_of(msg)
     picked = [AXES.index(a) for a in config.axes]
     if rotation is None and max(picked) > 2:
-        return malformed("orientation is NaN or no unit quaternion")
+        alone = hasattr(msg, "point")
+        return malformed(
+            "a point has no orientation: set axes: [x, y, z]" if alone else "orientation is NaN or no unit quaternion"
+        )
     angles = np.zeros(3) if rotation is None else rpy_from_rotation(rotation)
     value = np.concatenate([position, angles])[picked]
     if not np.isfinite(value).all():
@@ -501,8 +519,8 @@ def _pose(msg: Any, stamp_ns: int, seq: int, sensor: str, config: PoseConfig) ->
     if np.abs(value).max() > MOST_DISTANCE_M:
         return malformed(f"position is over {MOST_DISTANCE_M / 1e3:g} km from the datum")
     default = np.array([config.default_sigma_m] * 3 + [np.radians(config.default_sigma_deg)] * 3) ** 2
-    plain = not hasattr(msg.pose, "covariance")
-    cov = np.zeros((6, 6)) if plain else covariance_translation_first(msg.pose.covariance)
+    told = getattr(getattr(msg, "pose", None), "covariance", None)
+    cov = np.zeros((6, 6)) if told is None else covariance_translation_first(told)
     cov = cov[np.ix_(picked, picked)]
     mode = PoseMode(value=value, cov=usable_covariance(cov, default[picked]))
     return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=seq, axes=config.axes, modes=(mode,))
@@ -562,9 +580,7 @@ DECODERS: dict[tuple[str, str], Decoder] = {
     ("body_velocity", VECTOR): _body_velocity_vector,
     **{("body_velocity", msgtype): _body_velocity_nmea for msgtype in NMEA},
     **{("body_velocity", msgtype): _body_velocity_number for msgtype in NUMBERS},
-    ("pose", POSE): _pose,
-    ("pose", PLAIN_POSE): _pose,
-    ("pose", ODOMETRY): _pose,
+    **{("pose", msgtype): _pose for msgtype in POSE_TYPES},
     **{(part.kind, msgtype): _by_maker(part) for msgtype, parts in VENDORS.items() for part in parts},
 }
 

@@ -29,7 +29,7 @@ from graphloc.frontends._assess import (
 from graphloc.frontends._assess_compass import compass_report, headings, says_the_same
 from graphloc.frontends._assess_imu import felt_of, imu_report, series_of, turned_as_its_heading
 from graphloc.frontends._assess_receivers import apart, apart_warning, height_wanders_m
-from graphloc.frontends._assess_velocity import motions_of, odometry_report, velocity_report
+from graphloc.frontends._assess_velocity import motion_of_poses, motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_wander import changes, way_of
 from graphloc.frontends._assess_world import in_map_grid, world_of
 from graphloc.frontends._clock import usual_latency_s
@@ -62,10 +62,8 @@ from graphloc.frontends.decode import (
     NAV_SAT_FIX,
     NMEA,
     NUMBERS,
-    ODOMETRY,
-    PLAIN_POSE,
     PLAIN_TWIST,
-    POSE,
+    POSE_TYPES,
     QUATERNION,
     TWIST,
     VECTOR,
@@ -145,6 +143,8 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     motions = motions_of(wheels, velocities, bag.of_type(*_FIXES))
     if not gnss and (motion := motion_of_places("the poses in a map grid", reference.stamps_ns, reference.p_m)):
         motions.append(motion)
+    if not gnss:
+        motions += [m for s, report in odometry if report.role == "pose" and (m := motion_of_poses(s))]
     known = len(reference.stamps_ns) > 0
     courses = courses_of(reference.stamps_ns, reference.p_m, reference.scatter_m) if known else None
     imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, motions, courses, tree, body))]
@@ -287,7 +287,7 @@ def _odometry_reports(
     mount = bag.tree.resolve(bag.tree.body(), frame) if frame else None
     antenna_m = None if mount is None else mount[0]
     found = []
-    for stream in bag.of_type(ODOMETRY, POSE, PLAIN_POSE):
+    for stream in bag.of_type(*POSE_TYPES):
         world = world_of(stream, reference.stamps_ns, reference.p_m, reference.first, antenna_m)
         found.append((stream, odometry_report(stream, reference.stamps_ns, reference.p_m, world, reference.scatter_m)))
     return found
@@ -362,6 +362,12 @@ def _lacking(
 ) -> list[str]:
     """Say which required sensors are missing, and then also which topics have an unsupported type: they may be it."""
     lines = []
+    poses = [report.topic for report in odometry if report.role == "pose"]
+    if poses and not (gnss or bag.cameras or any(report.grid for report in odometry)):
+        said = f"nothing but poses tells the place ({', '.join(poses)}), and the draft has them switched off"
+        lines.append(
+            f"{said}: set enabled: true, and datum: where their origin lies (any place will do for a track in their own frame)"
+        )
     if not any(not imu.missing for imu in imus):
         lines.append("no whole IMU in it: smooth, replay and compare need one (sensor_msgs/Imu, 50 Hz or more)")
     if not (gnss or bag.cameras or any(report.role == "pose" or report.grid for report in odometry)):
@@ -525,7 +531,7 @@ def _best_track(bag: Contents, gnss: Sequence[GnssReport]) -> _Track:
 
 def _grid_track(bag: Contents) -> _Track:
     """Return the first track in a map grid, about its first position; the grid's north is off by a few degrees."""
-    for stream in bag.of_type(ODOMETRY, POSE, PLAIN_POSE):
+    for stream in bag.of_type(*POSE_TYPES):
         keep = sane(stream)
         p_m = stream.rows[keep, :3]
         good = np.isfinite(p_m).all(axis=1)

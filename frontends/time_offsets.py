@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion
 from graphloc.frontends._clock import MOST_LATE_S, MOST_ON_ITS_WAY_S
-from graphloc.frontends._mount_yaw import FEWEST, MOVES_M, STEP_S, Felt, bent, windows_of
+from graphloc.frontends._mount_yaw import FEWEST, MOVES_M, STEP_S, Felt, bent, unbroken, windows_of
 from graphloc.frontends._turns import without_line
 from graphloc.frontends.turning import Turning
 from graphloc.signals.series import integral
@@ -122,7 +122,7 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
         margin = half_s + MOST_LATE_S
         middle = np.arange(max(t[0], at[0]) + margin, min(t[-1], at[-1]) - margin, STEP_S)
         moved, chord = bent(at, motion.way_m, middle, half_s)
-        good = np.abs(chord) > MOVES_M
+        good = (np.abs(chord) > MOVES_M) & unbroken(at, middle, half_s)
         windows = float(good.sum() * STEP_S / half_s)
         if windows < FEWEST:
             continue
@@ -182,6 +182,7 @@ def later_than(fixes: MeasuredMotion, velocity: MeasuredMotion) -> tuple[float, 
     at, there = fixes.t_s, velocity.t_s + (velocity.origin_ns - fixes.origin_ns) / NS_PER_S
     margin = _CHORD_S + MOST_LATE_S
     middle = np.arange(max(at[0], there[0]) + margin, min(at[-1], there[-1]) - margin, STEP_S)
+    middle = middle[unbroken(at, middle, _CHORD_S) & unbroken(there, middle, _CHORD_S)]
     windows = len(middle) * STEP_S / _CHORD_S
     if windows < FEWEST:
         return None

@@ -88,6 +88,9 @@ def _why_no_receiver(recording: Recording, config: VesselConfig) -> str:
     if unread:
         told = "`graphloc inspect` says whether its fixes can be used"
         return f": vessel.yaml has none for {', '.join(unread)}; {told}. Add it, or set datum: in vessel.yaml"
+    off = [name for name, sensor in config.sensors.items() if sensor.kind == "pose" and not sensor.enabled]
+    if off:
+        return f", and {', '.join(off)} is switched off; switch it on (enabled: true), and set datum: in vessel.yaml"
     # Those in world were asked for their datum before.
     return ", nor another that measures position (matches, tags, poses): without one the vessel cannot be placed"
 

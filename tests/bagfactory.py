@@ -117,6 +117,17 @@ class Messages:
             header=self.header(stamp_ns), pose=self._pose(xyz, xyzw, covariance)
         )
 
+    def transform(self, stamp_ns: int, xyz: Sequence[float], xyzw: Sequence[float] = (0, 0, 0, 1)) -> Any:
+        transform = self.t["geometry_msgs/msg/Transform"](translation=self.vector(xyz), rotation=self.quat(xyzw))
+        return self.t["geometry_msgs/msg/TransformStamped"](
+            header=self.header(stamp_ns, "hall"), child_frame_id="craft", transform=transform
+        )
+
+    def point(self, stamp_ns: int, xyz: Sequence[float]) -> Any:
+        x, y, z = (float(v) for v in xyz)
+        point = self.t["geometry_msgs/msg/Point"](x=x, y=y, z=z)
+        return self.t["geometry_msgs/msg/PointStamped"](header=self.header(stamp_ns, "hall"), point=point)
+
     def _twist(self, v: Sequence[float], covariance: Any) -> Any:
         twist = self.t["geometry_msgs/msg/Twist"](linear=self.vector(v), angular=self.vector((0, 0, 0)))
         cov = np.zeros(36) if covariance is None else np.array(covariance, dtype=float).ravel()

@@ -182,6 +182,17 @@ def test_pose_without_covariance_or_orientation() -> None:
     refused(MAKE.pose(T, (np.nan, 0, 0)), PoseConfig(), Outcome.MALFORMED, "NaN")
 
 
+def test_a_pose_by_motion_capture_and_a_point_of_a_total_station() -> None:
+    (mode,) = decode(MAKE.transform(T, (1, 2, 3), yaw_quaternion(40.0)), PoseConfig(axes=("x", "y", "z", "yaw"))).modes
+    np.testing.assert_allclose(mode.value, [1, 2, 3, np.radians(40.0)])
+    np.testing.assert_allclose(mode.cov, np.diag([0.09, 0.09, 0.09, np.radians(2.0) ** 2]))
+    (mode,) = decode(MAKE.point(T, (1, 2, 3)), PoseConfig(axes=("x", "y", "z"))).modes
+    np.testing.assert_allclose(mode.value, [1, 2, 3])
+    refused(
+        MAKE.point(T, (1, 2, 3)), PoseConfig(), Outcome.MALFORMED, "a point has no orientation: set axes: [x, y, z]"
+    )
+
+
 def test_a_replaced_axis_loses_its_correlations() -> None:
     cov = np.array([[1.0, 0.5, 0.5], [0.5, np.nan, 0.5], [0.5, 0.5, 1.0]])
     expected = [[1.0, 0.0, 0.5], [0.0, 7.0, 0.0], [0.5, 0.0, 1.0]]

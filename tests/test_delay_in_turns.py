@@ -6,7 +6,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from graphloc.frontends._assess import MeasuredMotion
-from graphloc.frontends._mount_yaw import Felt
+from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
 from graphloc.frontends.time_offsets import MotionOffset, motion_time_offset
 from graphloc.signals.series import integral
 
@@ -61,3 +61,29 @@ def test_slow_fixes_tell_a_delay_as_fast_ones_do(late_s: float) -> None:
     assert offset is not None
     assert offset.clear == (late_s > 0.0)
     assert offset.value_s == pytest.approx(-late_s, abs=0.015)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.5])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_velocity_that_fails_in_a_tunnel_tells_no_delay_of_it(late_s: float, seed: int) -> None:
+    """A car of 12 m/s that turns at the begin of tunnels and speeds up in them: the straight line across fitted an offset, clearly."""
+    rng, t = np.random.default_rng(seed), np.arange(0.0, 400.0, 1.0 / RATE_HZ)
+    knots = np.arange(0.0, 401.0, 8.0)
+    speed = gaussian_filter1d(np.interp(t, knots, rng.uniform(6.0, 15.0, len(knots))), RATE_HZ)
+    rate = gaussian_filter1d(np.interp(t, knots, 0.1 * rng.normal(size=len(knots))), RATE_HZ)
+    heads, zero = np.exp(1j * integral(t, rate)), np.zeros(len(t))
+    accel = np.column_stack([np.gradient(speed, t), speed * rate, zero + 9.81]) + 0.1 * rng.normal(size=(len(t), 3))
+    stamps, gyro = (t * 1e9).astype(np.int64), np.column_stack([zero, zero, rate])
+    at = np.arange(0.0, 400.0, 0.1)
+    at = at[~(((at > 85.0) & (at < 160.0)) | ((at > 222.0) & (at < 345.0)))]
+    v = np.interp(at, t, speed * heads) + 0.08 * (rng.normal(size=(2, len(at))).T @ [1.0, 1j])
+    motion = MeasuredMotion("velocity", 0, at + late_s, np.abs(v), integral(at, v))
+    offset = motion_time_offset(Felt.of(stamps, accel, gyro, 9.81), motion)
+    assert offset is not None
+    assert offset.clear == (late_s > 0.0)
+    assert offset.value_s == pytest.approx(-late_s, abs=0.05)
+    if late_s == 0.0:  # nor does it blur how the IMU sits
+        mount = yaw_in_craft(stamps, accel, gyro, [motion])
+        assert mount is not None
+        assert mount.coherence > 0.97
+        assert mount.yaw_deg == pytest.approx(0.0, abs=2.0)

@@ -938,6 +938,61 @@ def test_fixes_that_are_stamped_late_get_an_offset(late_s: float, tmp_path: Path
     assert config.sensors["gnss"].stamp_sigma_s >= 0.05  # what is left is estimated with the run
 
 
+def in_a_hall(make: Messages, yaw_deg: float, of: Callable[[int, list[float], list[float]], Any]) -> list[Item]:
+    """A multirotor that leans into its accelerations for 60 s, so that it feels none along its deck; its IMU's x looks up.
+
+    Args:
+        yaw_deg: of the IMU, once level. of: the message of where it is, of its stamp, place and attitude (x, y, z, w).
+    """
+    t = np.arange(0.0, 60.0, 0.02)
+    place = np.column_stack([1.5 * np.sin(0.9 * t), np.sin(1.3 * t + 1.0), 1.0 + 0.2 * np.sin(0.5 * t)])
+    accel = np.gradient(np.gradient(place, t, axis=0), t, axis=0)
+    yaw = 1.5 * np.sin(0.3 * t)
+    ahead = np.cos(yaw) * accel[:, 0] + np.sin(yaw) * accel[:, 1]
+    left = -np.sin(yaw) * accel[:, 0] + np.cos(yaw) * accel[:, 1]
+    R = Rotation.from_euler("ZYX", np.column_stack([yaw, np.arctan(ahead / G), -np.arctan(left / G)]))
+    rate = np.vstack([(R[:-1].inv() * R[1:]).as_rotvec() / 0.02, np.zeros(3)])
+    accel[:, 2] += G
+    felt = R.inv().apply(accel) + np.random.default_rng(1).normal(0.0, 0.05, (len(t), 3))
+    x_up = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    M = rotation_z(yaw_deg) @ x_up
+    items: list[Item] = []
+    for k in range(len(t)):
+        at = START_NS + k * S // 50
+        items.append(("/imu", at, make.imu(at, M.T @ felt[k], M.T @ rate[k])))
+        if k % 2 == 0:
+            items.append(("/hall/craft", at, of(at, place[k].tolist(), R[k].as_quat().tolist())))
+    return items
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 180.0])
+def test_motion_capture_alone_tells_the_place_and_how_the_imu_sits(yaw_deg: float, tmp_path: Path) -> None:
+    """Its messages were not read, `inspect` said that nothing told the place, and took the IMU's yaw as 0: no run could be solved."""
+    make = Messages(2)
+    found, config, text = look(tmp_path, in_a_hall(make, yaw_deg, make.transform), make)
+    turn = Rotation.from_euler("xyz", config.sensors["imu"].mount.rpy_deg, degrees=True).as_matrix()
+    x_up = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    np.testing.assert_allclose(turn, rotation_z(yaw_deg) @ x_up, atol=1e-9)
+    (said_of_poses,) = [w for w in found.warnings if "nothing but poses tells the place" in w]
+    assert "/hall/craft" in said_of_poses
+    assert "set enabled: true, and datum:" in said_of_poses
+    told = text.replace("enabled: false  # guess: true if its frame", "enabled: true  #")
+    told = told.replace(
+        "# datum: {latitude_deg: , longitude_deg: ,", "datum: {latitude_deg: 58.0, longitude_deg: 12.0,"
+    )
+    (tmp_path / "told.yaml").write_text(told)
+    sensor = load_config(tmp_path / "told.yaml", KINDS).sensors["pose"]
+    assert sensor.enabled
+    assert sensor.axes == ("x", "y", "z", "yaw")
+
+
+def test_points_alone_tell_the_place_without_a_heading(tmp_path: Path) -> None:
+    make = Messages(2)
+    found, config, _ = look(tmp_path, in_a_hall(make, 0.0, lambda at, p, _: make.point(at, p)), make)
+    assert any("nothing but poses tells the place" in w for w in found.warnings)
+    assert config.sensors["pose"].axes == ("x", "y", "z")
+
+
 @pytest.mark.parametrize("heading", ["late, hardly turning", "in time, turning"])
 def test_a_heading_of_late_messages_is_as_late_as_the_place_in_them(heading: str, tmp_path: Path) -> None:
     """One message has one stamp: the place had got its offset, and the heading beside it, whose slow turns tell nothing, had not."""

@@ -32,6 +32,10 @@ _SMALL_M = 0.1  # a slow error below it is that of RTK
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
 _BY_CHANCE = 1e-3  # anywhere in the run; a choice
 _UNAIDED_S = 30.0  # at an end of the run, from which the IMU alone is metres off
+_WANDERS_S, _WANDERS = (
+    60.0,
+    4.0,
+)  # time; sigmas of a bias's random walk over it: smoothed, a bias that walks so moves by less than two
 _LEVELS_M = 0.5  # sigma, for levels that may be the usual ones as well: said from there on
 
 
@@ -210,6 +214,7 @@ def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[
         warnings.append("the solver did not converge: the last pass still moved the track by centimetres or more")
     warnings += _unaided_ends(problem)
     warnings += noise_warnings(problem, result)
+    warnings += _wandering_biases(problem, result)
     if expected > 0 and result.cost > CONTRADICTING_COST * expected:
         said = f"the cost is {result.cost / expected:.1f} times its expectation: noise is configured too small, or a "
         said += "mount, a unit or a time offset is wrong"
@@ -236,6 +241,32 @@ def _unaided_ends(problem: Problem) -> list[str]:
         for silent_ns, when in ends
         if silent_ns > _UNAIDED_S * NS_PER_S
     ]
+
+
+def _wandering_biases(problem: Problem, result: BatchResult) -> list[str]:
+    """Return a line on biases that wander by far more than their random walk allows, as those of a cheap IMU that warms up do.
+
+    Axes that gravity shows tell it. The rate about the vertical wanders as much, unseen where nothing measures the heading.
+    """
+    nodes, first = np.unique(problem.timeline.slow_of, return_index=True)
+    t_s = (problem.timeline.stamps_ns[first] - problem.timeline.stamps_ns[0]) / NS_PER_S
+    later = np.searchsorted(t_s, t_s + _WANDERS_S)
+    begin = np.flatnonzero(later < len(t_s))
+    if not len(begin):
+        return []
+    of = [result.values.atConstantBias(keys.bias(int(j))) for j in nodes]
+    bias = np.array([np.concatenate([b.accelerometer(), b.gyroscope()]) for b in of])
+    walked = np.abs(bias[later[begin]] - bias[begin]).max(axis=0) / problem.links.bias_steps(_WANDERS_S)
+    config, warnings = problem.config.sensors[problem.imu.sensor], list[str]()
+    for what, key, times, bounds in (
+        ("accelerometers", "accel_bias_instability_ug", walked[:3].max(), "roll, pitch and position"),
+        ("gyroscopes", "gyro_bias_instability_deg_per_h", walked[3:].max(), "the heading"),
+    ):
+        if times > _WANDERS:
+            said = f"{problem.imu.sensor}: a bias of its {what} changes within {_WANDERS_S:.0f} s by {times:.1f} sigmas of what {key} allows"
+            cure = f"it warms up, or is a cheap one; set {key}: {float(f'{times * getattr(config, key):.2g}'):g} or more, until this line is gone: else the bounds of {bounds} are too small"
+            warnings.append(Graded(f"{said}: {cure}", f"wandering {what}", float(times)))
+    return warnings
 
 
 def noise_warnings(problem: Problem, result: BatchResult) -> list[str]:
