@@ -73,10 +73,8 @@ class TagsSeen:
         off, late_s = self.slow[6 * self.rides :][:3], self.slow[6 * self.rides + 3 * self.mounted :][: int(self.timed)]
         if self.timed:
             rate = R_world_body @ at.gyro_radps
-            swing = skew(rate) @ arm
-            self.by_late = -np.concatenate([at.v_world_mps + at.dv_world_mps + swing, rate])
+            self.by_late = -np.concatenate([at.v_world_mps + at.dv_world_mps + skew(rate) @ arm, rate])
             self.p = self.p + self.by_late[:3] * late_s
-            self.body[:3] += late_s * skew(swing) @ self.body[3:]  # the swing turns with the body
             R_world_body = gtsam.Rot3.Expmap(self.by_late[3:] * late_s).matrix() @ R_world_body
         if self.mounted:
             self.by_mount = R_world_body @ np.asarray(gtsam.Rot3.ExpmapDerivative(-off))

@@ -75,7 +75,6 @@ SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {
     "gnss": (*_RECEIVER, {}),
     "gnss_velocity": _RECEIVER,
     "pose": (_POSES, {"axes": AXES, "slow_error": {"sigma_m": 1.0}}),
-    "apriltag": ({"cameras": {name: {"topic": f"/{name}"} for name in ("aft", "camera")}},),
 }
 """With all that a sensor may be off by; and with less, where its state or factor is another then."""
 CASES = [
@@ -85,7 +84,7 @@ CASES = [
     for slow in (True, False)
     if not slow or row.slow(config_of(row)) is not None
 ]
-NOT_OF_VELOCITY = {"gnss", "aerial", "apriltag"}
+NOT_OF_VELOCITY = {"gnss", "aerial"}
 """A delay makes them depend on it, which their factors do not say (see their docstrings)."""
 
 

@@ -397,9 +397,10 @@ class OnlineSmoother:
             self._ledger.used(sample)
         self._waiting.taken()
         solved = (started.pose, started.velocity, started.bias)
-        self._tracking = tracking = Tracking(self._setup, persistent, self._ledger, started.anchor, samples, solved)
-        self._ledger.enter(started.rows)
+        tracking = Tracking(self._setup, persistent, self._ledger, started.anchor, samples, solved)
         persistent.unmodelled = tracking.lag.unmodelled(started.before)
+        self._tracking = tracking  # last of what can fail, as it has to hold the measurements then
+        self._ledger.enter(started.rows)
         tracking.catch_up(started.anchor, samples, others, until_ns)
         self._keep_anchor(tracking)
         newest_ns = tracking.lag.newest.stamp_ns
