@@ -161,7 +161,7 @@ def _nis(m: Measurement, config: object, row: Sensor, at: Attachment, there: _Th
             column = (other.raw - r.raw) / _STEP * slow.sigma[k]
             shared[i] = shared[i] + np.outer(column, column)
     for i, r in enumerate(found):
-        for constant, jacobian in zip(constants, r.constant_jacobians(), strict=False):
+        for constant, jacobian in zip(constants, r.constant_jacobians(), strict=True):
             shared[i] = shared[i] + (jacobian * constant.sigma**2) @ jacobian.T
     nis = [r.nis(s) for r, s in zip(found, shared, strict=True)]
     best = int(np.argmin(nis))

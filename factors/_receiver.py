@@ -21,7 +21,7 @@ def stamps_and_antenna(config: GnssConfig | VelocityConfig) -> tuple[Constant, .
         unknown |= dict.fromkeys(PLACE, config.mount_sigma_m)
     if not unknown:
         return ()
-    # One of all: a linear factor has three states at most.
+    # One of all: a linear factor of more than three states takes longer to make.
     return (Constant(name="stamps and antenna", sigma=np.array([*unknown.values()]), corrects=tuple(unknown)),)
 
 

@@ -171,7 +171,8 @@ def unbroken(times_s: Array, middle_s: Array, half_s: float) -> NDArray[np.bool_
 
     Across a tunnel a straight line tells nothing of how the craft moved, and as it changes at both ends it fits some motion at some lag.
     """
-    gap = np.flatnonzero(np.diff(times_s) * _NEARLY > half_s)
+    apart_s = np.diff(times_s)
+    gap = np.flatnonzero(apart_s > max(half_s / _NEARLY, 2.0 * float(np.median(apart_s))))  # no jitter of a slow sensor
     begins, ends = np.append(times_s[gap], np.inf), np.append(times_s[gap + 1], np.inf)
     return np.asarray(begins[np.searchsorted(ends, middle_s - half_s, side="right")] >= middle_s + half_s)
 

@@ -30,6 +30,7 @@ from graphloc.frontends.decode import (
     ODOMETRY,
     PLACES,
     PLAIN_TWIST,
+    POINT,
     QUATERNION,
     TWIST,
     UNSTAMPED,
@@ -89,7 +90,7 @@ ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
 }
 # Places that no sensor of the craft says: wanted ones, the origin of a filter, other vessels, the truth.
 _ELSEWHERE = re.compile(
-    r"origin|home(?![a-z])|set_?point|goal|target|waypoint|cmd|command|desired|contact|aton|anchor|truth|/gt(?![a-z])",
+    r"click|person|obstacle|look_?ahead|origin|home(?![a-z])|set_?point|goal|target|waypoint|cmd|command|desired|contact|aton|anchor|truth|/gt(?![a-z])",
     re.IGNORECASE,
 )
 _HEADING = re.compile(r"head|hdg|hdt|yaw|compass|azimuth", re.IGNORECASE)  # a topic of numbers that may be one
@@ -360,7 +361,10 @@ def _empty_streams(bag: Bag) -> dict[str, TopicData]:
     streams = {
         t.topic: TopicData(t.topic, t.msgtypes[0])
         for t in bag.topics.values()
-        if len(t.msgtypes) == 1 and t.msgtypes[0] in ROWS and (t.msgtypes[0] not in NUMBERS or _HEADING.search(t.topic))
+        if len(t.msgtypes) == 1
+        and t.msgtypes[0] in ROWS
+        and (t.msgtypes[0] not in NUMBERS or _HEADING.search(t.topic))
+        and not (t.msgtypes[0] == POINT and _ELSEWHERE.search(t.topic))
     }
     for t in bag.topics.values():
         if (

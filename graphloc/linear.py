@@ -106,9 +106,7 @@ def linear_update(
         arguments += [term.key, whiten * term.jacobian if single else whiten @ term.jacobian]
         if term.offset is not None:
             raw = raw - term.jacobian @ term.offset
-    make: Any = (
-        gtsam.JacobianFactor if len(terms) < 4 else _of_four_states
-    )  # the stubs know one overload per number of states
+    make = _jacobian_factor if len(terms) < 4 else _of_four_states
     linear = make(*arguments, -whiten @ raw, _unit(len(raw)))
     return GraphUpdate(factors=(gtsam.LinearContainerFactor(linear, points),))
 

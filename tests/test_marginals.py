@@ -4,9 +4,11 @@ from typing import Any
 
 import gtsam
 import numpy as np
+import pytest
 
 from graphloc import app, keys
 from graphloc.build import make_problem
+from graphloc.errors import SolveError
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
@@ -88,3 +90,15 @@ def test_covariances_of_a_run_are_those_that_gtsam_finds_one_by_one() -> None:
         np.testing.assert_allclose(
             tree.marginalCovariance(key) / np.outer(sigma, sigma), cov / np.outer(sigma, sigma), atol=1e-6
         )
+
+
+def test_what_nothing_determines_is_no_covariance() -> None:
+    """Of a variable of two, of which one component is measured: the other was known exactly."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    values.insert(keys.velocity(0), np.zeros(2))
+    measured = gtsam.JacobianFactor(
+        keys.velocity(0), np.array([[1.0, 0.0], [0.0, 0.0]]), np.zeros(2), gtsam.noiseModel.Unit.Create(2)
+    )
+    graph.add(gtsam.LinearContainerFactor(measured, values))
+    with pytest.raises(SolveError, match="the covariance could not be computed"):
+        marginals(graph, values)

@@ -4,6 +4,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
-from graphloc.measurements import GnssPosition, Measurement
+from graphloc.measurements import CompassHeading, GnssPosition, Measurement
 from graphloc.online import OnlineSmoother
 from graphloc.online._sensor_clock import SensorClock
 from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish
@@ -94,7 +95,33 @@ def test_an_estimate_that_wrong_stamps_have_misled_starts_anew(by_s: float) -> N
     misled = by_s < 10.0  # else the IMU has yet to reach the first of them
     assert fed.events.count("gnss was used at wrong times: restarts") == misled
     assert not any("position jump" in e for e in fed.events)
+    assert all(a.stamp_ns < b.stamp_ns for a, b in pairwise(fed.estimates))
     assert largest_m(fed, begin_ns) < largest_m(undisturbed(), begin_ns) + 0.5  # of a vessel that goes 2.5 m/s
+
+
+def test_an_estimate_that_had_nothing_of_wrong_stamps_goes_on() -> None:
+    """A compass that is 30 s behind at first: all of it came too late, so nothing was misled."""
+    begin_ns = arrivals_of(run_of())[0].true_ns
+    behind = [
+        replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns - 30 * 10**9))
+        if isinstance(a.m, CompassHeading) and a.true_ns < begin_ns + 18e9
+        else a
+        for a in arrivals_of(run_of())
+    ]
+    fed = whole(
+        behind,
+        OnlineSmoother(
+            run_of().config.with_start_heading(90.0 - float(np.degrees(run_of().truth.yaw_rad[0]))),
+            rows=SENSORS,
+            inertial=INERTIAL,
+        ),
+    )
+    assert complaints(behind, fed) == []
+    assert any(e.startswith("compass: its stamps were 30.0 s behind") for e in fed.events)
+    assert fed.estimates[0].stamp_ns < begin_ns + 16e9
+    assert not any("restarts" in e for e in fed.events)
+    stamps_ns = [e.stamp_ns for e in fed.estimates]
+    assert all(a < b for a, b in pairwise(stamps_ns))
 
 
 def largest_m(fed: Fed, begin_ns: int) -> float:

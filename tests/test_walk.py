@@ -18,6 +18,7 @@ from graphloc.online._entries import Entry
 from graphloc.online._live import LiveStream
 from graphloc.replay import replay
 from graphloc.solve.decide import Verdict
+from graphloc.time import NS_PER_S
 from tests.slowly import simulate_slowly
 
 SLOW = SlowProcess(
@@ -95,6 +96,18 @@ def test_how_far_apart_fixes_are_does_not_depend_on_the_order_of_arrival() -> No
         spaced.append({stream.measurements[k].stamp_ns: stream.apart_s[k] for k in range(len(fixes))})
     assert spaced[1] == spaced[0]
     assert list(spaced[0].values()) == pytest.approx([np.inf, *[0.1] * (len(fixes) - 1)])
+
+
+def test_slow_fixes_are_not_silent() -> None:
+    """Every 5 s: a receiver that resolves its ambiguities anew after 2 s without RTK would do so at each of them."""
+    fixes = [m for m in simulate(bl_scenario(1, "drift"), 0).recording.measurements if isinstance(m, GnssPosition)]
+    stream = LiveStream(0, "gnss", GNSS, GnssConfig(), replace(SLOW, anew_after_s=2.0), None, (), None)
+    for k in range(6):
+        stream.measurements.append(replace(fixes[0], stamp_ns=k * 5 * NS_PER_S))
+        stream.space()
+        stream.told_ns = k * 5 * NS_PER_S
+    assert not stream.drawn_anew(stream.told_ns + 6 * NS_PER_S)
+    assert stream.drawn_anew(stream.told_ns + 16 * NS_PER_S)
 
 
 def test_a_factor_is_replaced_where_the_walk_of_its_fix_turns_out_to_be_another() -> None:

@@ -77,9 +77,9 @@ class PoseSlowErrorConfig(Block):
 
 
 class PoseConfig(AnyPoseConfig):
-    """Absolute pose in world (`geometry_msgs/PoseWithCovarianceStamped`, `PoseStamped`, `TransformStamped`, `nav_msgs/Odometry`).
+    """Absolute pose in world (`geometry_msgs/PoseWithCovarianceStamped`, `PoseStamped`, `TransformStamped`, `PointStamped` (x, y, z), `nav_msgs/Odometry`).
 
-    Of a `PointStamped` only x, y and z can be used (`axes`).
+    Of a point only x, y and z can be used (`axes`).
     """
 
     kind: Literal["pose"] = "pose"

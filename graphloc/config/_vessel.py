@@ -91,7 +91,7 @@ class VesselConfig(Block):
     sensors: dict[str, Any] = Field(default_factory=dict)
     """Sensors by name; `kind` in each block selects the sensor kind."""
     truth_topic: str | None = None
-    """Topic with the true body pose in world (`nav_msgs/Odometry`), for comparisons only; never fused."""
+    """Topic with the true body pose in world (`nav_msgs/Odometry`, `geometry_msgs/PoseStamped`, `PoseWithCovarianceStamped`, `TransformStamped`), for comparisons only; never fused."""
     check_speed_topic: str | None = None
     """`nav_msgs/Odometry` whose forward speed is compared with the solution's; never fused."""
     timeline: TimelineConfig = TimelineConfig()

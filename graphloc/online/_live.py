@@ -7,6 +7,8 @@ import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Collection, MutableMapping
 from dataclasses import dataclass, field
+from itertools import pairwise
+from statistics import median
 from typing import Any, Generic, TypeVar
 
 import gtsam
@@ -41,6 +43,7 @@ from graphloc.signals.position_jumps import JumpDetector, PositionJump
 from graphloc.time import NS_PER_S, duration_ns
 
 T = TypeVar("T")
+_USUAL = 16  # the last measurements, by which it is taken how far apart they usually come
 _PAGE_S = 1.0  # states are marginalised in pages of this length
 
 
@@ -238,10 +241,11 @@ class LiveStream:
 
     def drawn_anew(self, stamp_ns: int) -> bool:
         """Return whether its slow error is drawn anew at a stamp: once as it has been silent for so long."""
-        if self.slow is None or self.told_ns == self.anew_ns:
+        silent_ns = stamp_ns - self.told_ns
+        if self.slow is None or self.told_ns == self.anew_ns or silent_ns <= self.slow.anew_after_s * NS_PER_S:
             return False
-        apart_s = self.apart_s[len(self.measurements) - 1] if self.by_stamp else 0.0
-        if stamp_ns - self.told_ns <= silent_s(self.slow, apart_s if math.isfinite(apart_s) else 0.0) * NS_PER_S:
+        usual_ns = [b - a for (a, _), (b, _) in pairwise(self.by_stamp[-_USUAL:])]
+        if silent_ns <= silent_s(self.slow, median(usual_ns or [0.0]) / NS_PER_S) * NS_PER_S:
             return False
         self.anew_ns = self.told_ns
         return True

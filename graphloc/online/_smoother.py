@@ -188,12 +188,13 @@ class OnlineSmoother:
             return None
         taken = self._persistent.clocks[m.sensor].take(m, newest.stamp_ns)
         self._say(taken.said)
-        made = self._put_right(m.sensor, taken.earlier_off_ns) if taken.earlier_off_ns else None
+        if taken.earlier_off_ns:
+            self._put_right(m.sensor, taken.earlier_off_ns)
         for right in taken.found:
             self._take(right)
-        return made
+        return None
 
-    def _put_right(self, sensor: str, off_ns: int) -> Estimate | None:
+    def _put_right(self, sensor: str, off_ns: int) -> None:
         """Put right what is held of a sensor whose stamps were ahead by so much; an estimate that it has misled starts anew."""
 
         def right(m: Measurement) -> Measurement:
@@ -203,10 +204,13 @@ class OnlineSmoother:
         if tracking is None:
             for m in self._waiting.taken():
                 self._waiting.hold(right(m))
-            return None
-        came = [right(m) for m in tracking.since(tracking.lag.first_ns)]
-        self._persistent.receivers.pop(sensor, None)
-        return self._start_over(tracking, tracking.lag.first_ns, f"{sensor} was used at wrong times", came=came)
+        elif any(row.sensor == sensor and row.weight for row in tracking.lag.held()):
+            came = [right(m) for m in tracking.since(tracking.lag.first_ns)]
+            self._persistent.receivers.pop(sensor, None)
+            self._start_over(tracking, tracking.lag.first_ns, f"{sensor} was used at wrong times", came=came)
+        else:
+            for m in tracking.taken_back(sensor):
+                self._take(right(m))
 
     def _take(self, m: Measurement) -> None:
         """Keep a measurement, its stamp put right, until the states reach it."""

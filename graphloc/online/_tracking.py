@@ -134,6 +134,13 @@ class Tracking:
         if len(self._pending) > _PENDING:
             self._ledger.drop(self._pending.pop(), Outcome.REJECTED, "too many measurements wait for the IMU")
 
+    def taken_back(self, sensor: str) -> list[Measurement]:
+        """Return what waits for the IMU of a sensor, and keep it no more."""
+        back = [m for m in self._pending if m.sensor == sensor]
+        self._pending = [m for m in self._pending if m.sensor != sensor]
+        self._recent.forget(back)
+        return back
+
     def keep_imu(self, m: ImuSample, hole: tuple[int, int] | None) -> None:
         """Keep an IMU sample; `hole`: of one that came late, the stamps (ns) of the samples before and after it."""
         if self._held_out and self._doubt.over(m.stamp_ns):

@@ -51,7 +51,9 @@ class _Recovered:
 
     def add(self, conditional: Any) -> None:
         """Add a clique, by what it says of its own variables given those of its parent, which is known."""
-        names, root = conditional.keys(), dtrtri(conditional.R())[0]
+        names, (root, singular) = conditional.keys(), dtrtri(conditional.R())
+        if singular:
+            raise np.linalg.LinAlgError("a variable is not determined")
         rows, n, m = dict[int, range](), 0, len(root)
         for name in names:
             rows[name] = range(n, n := n + self._dim[name])
@@ -91,12 +93,12 @@ def marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, together:
         ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
         found = values.retract(tree.optimize())
-    except RuntimeError as error:
+        order = [ordering.at(n) for n in range(ordering.size())]
+        recovered = _Recovered(dim, order)
+        for key in reversed(order):  # parents before their children
+            if key not in recovered:
+                recovered.add(tree[key].conditional())
+    except (RuntimeError, np.linalg.LinAlgError) as error:
         raise not_solved("the covariance could not be computed", error) from error
-    order = [ordering.at(n) for n in range(ordering.size())]
-    recovered = _Recovered(dim, order)
-    for key in reversed(order):  # parents before their children
-        if key not in recovered:
-            recovered.add(tree[key].conditional())
     cov = {key: recovered.of((key,)) for key in order}
     return Marginals(found, cov, {pair: recovered.of(pair) for pair in together})

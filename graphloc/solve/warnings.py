@@ -32,10 +32,8 @@ _SMALL_M = 0.1  # a slow error below it is that of RTK
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
 _BY_CHANCE = 1e-3  # anywhere in the run; a choice
 _UNAIDED_S = 30.0  # at an end of the run, from which the IMU alone is metres off
-_WANDERS_S, _WANDERS = (
-    60.0,
-    4.0,
-)  # time; sigmas of a bias's random walk over it: smoothed, a bias that walks so moves by less than two
+_WANDERS_S = 60.0  # over which it is looked at how far a bias has gone
+_WANDERS = 4.0  # sigmas of its random walk over that: smoothed, a bias that walks so moves by less than two
 _LEVELS_M = 0.5  # sigma, for levels that may be the usual ones as well: said from there on
 
 
@@ -49,7 +47,7 @@ def slow_error_warning(sensor: str, left_out: SlowProcess | None, *, without_hei
         )
     if without_height:
         said.append(
-            f"{sensor}: its heights are not used: height_m of the height is known better than slow_error.vertical_sigma_m"
+            f"{sensor}: its heights are not used: the waterline (sigma_m, tide_sigma_m of the height) is known better than they are (slow_error.vertical_sigma_m)"
         )
     return said
 
@@ -257,6 +255,7 @@ def _wandering_biases(problem: Problem, result: BatchResult) -> list[str]:
     of = [result.values.atConstantBias(keys.bias(int(j))) for j in nodes]
     bias = np.array([np.concatenate([b.accelerometer(), b.gyroscope()]) for b in of])
     walked = np.abs(bias[later[begin]] - bias[begin]).max(axis=0) / problem.links.bias_steps(_WANDERS_S)
+    walked /= max(result.noise_scale, 1.0)  # with which it was solved
     config, warnings = problem.config.sensors[problem.imu.sensor], list[str]()
     for what, key, times, bounds in (
         ("accelerometers", "accel_bias_instability_ug", walked[:3].max(), "roll, pitch and position"),
