@@ -366,7 +366,7 @@ def _lacking(
     if poses and not (gnss or bag.cameras or any(report.grid for report in odometry)):
         said = f"nothing but poses tells the place ({', '.join(poses)}), and the draft has them switched off"
         lines.append(
-            f"{said}: set enabled: true, and datum: where their origin lies (any place will do for a track in their own frame)"
+            f"{said}: set enabled: true{' of the one that is of this vessel' if len(poses) > 1 else ''}, and datum: where their origin lies (any place will do for a track in their own frame)"
         )
     if not any(not imu.missing for imu in imus):
         lines.append("no whole IMU in it: smooth, replay and compare need one (sensor_msgs/Imu, 50 Hz or more)")

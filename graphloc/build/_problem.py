@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 
 from graphloc import keys
 from graphloc.build._attach import Carry, asks_for_delay, nav_state
-from graphloc.build._chains import spacing_s
 from graphloc.build._usual_motion import UsualMotion, usual_motion
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import Constant, Going, InertialLink, Sensor, SlowProcess
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement
-from graphloc.time import stamps_of
+from graphloc.time import NS_PER_S, stamps_of
 from graphloc.timeline import Timeline
 
 PositionJumps = tuple[NDArray[np.int64], Array]
@@ -87,7 +86,7 @@ class Stream:
             carry=tuple(self.carry[i] for i in few),
             gyro_radps=self.gyro_radps[indices],
             felt=self.felt[indices],
-            apart_s=spacing_s(stamps_of(measurements)),
+            apart_s=np.diff(stamps_of(measurements) / NS_PER_S, prepend=-np.inf),  # each stands for those left out before it
         )
 
 
