@@ -86,7 +86,8 @@ class Stream:
             carry=tuple(self.carry[i] for i in few),
             gyro_radps=self.gyro_radps[indices],
             felt=self.felt[indices],
-            apart_s=np.diff(stamps_of(measurements) / NS_PER_S, prepend=-np.inf),  # each stands for those left out before it
+            # Each stands for those that are left out before it.
+            apart_s=np.diff(stamps_of(measurements) / NS_PER_S, prepend=-np.inf),
         )
 
 
