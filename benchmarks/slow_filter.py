@@ -12,15 +12,13 @@ from graphloc import app
 from graphloc.config import VesselConfig
 from graphloc.eval.ekf import run_honest
 from graphloc.eval.ekf._honest import _DT_S, _HonestEkf
-from graphloc.eval.ekf._inputs import Interval, intervals_of, measurements_of, start_of
-from graphloc.eval.ekf._planar import _measurement, _planar, _update
+from graphloc.eval.ekf._inputs import Interval
+from graphloc.eval.ekf._planar import run_filter
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import bl_scenario, simulate
-from graphloc.frames import Array, Datum
-from graphloc.measurements import GnssPosition
+from graphloc.frames import Array
+from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Recording
-from graphloc.time import NS_PER_S
-from graphloc.trajectory import Trajectory
 
 _SLOW = slice(6, 8)
 
@@ -48,29 +46,15 @@ class SlowEkf(_HonestEkf):
         F[:6, :6], Q[:6, :6], Q[_SLOW, _SLOW] = own, noise, (1.0 - self._kept**2) * self._off_m2
         return np.append(moved, self._kept * x[_SLOW]), F @ P @ F.T + Q
 
-    def _slow(self, m: object, size: int) -> Array:
-        return np.zeros((size, size)) if isinstance(m, GnssPosition) else super()._slow(m, size)  # type: ignore[arg-type]
+    def _slow(self, m: Measurement, size: int) -> Array:
+        return np.zeros((size, size)) if isinstance(m, GnssPosition) else super()._slow(m, size)
 
 
-def run_slow(recording: Recording, config: VesselConfig, datum: Datum) -> Trajectory:
-    """Run it, as `eval.ekf` runs the others, but that fixes show the two states, too."""
-    ekf = SlowEkf(recording, config)
-    intervals, measured = intervals_of(recording, config, ekf.rate_hz), measurements_of(recording, config)
-    x, P = ekf.start(start_of(measured, recording, datum))
-    out, k = [(intervals[0].stop_ns - round(NS_PER_S / ekf.rate_hz), x, P)], 0
-    for step in intervals:
-        x, P = ekf.predict(x, P, step)
-        while k < len(measured) and measured[k].m.stamp_ns <= step.stop_ns:
-            mounted, k = measured[k], k + 1
-            r, planar, R = _measurement(mounted, x[:5], step.rate - x[5], datum)
-            H = np.hstack([planar, np.zeros((len(r), 3))])
-            if isinstance(mounted.m, GnssPosition):
-                H[:, _SLOW], r = np.eye(2), r - x[_SLOW]
-            taken = ekf.gate(mounted.m, r, H, P, R)
-            if not isinstance(taken, str):
-                x, P = _update(x, P, r, H, taken)
-        out.append((step.stop_ns, x, P))
-    return _planar(out)
+def _with_error(m: Measurement, x: Array, r: Array, H: Array) -> tuple[Array, Array]:
+    """Return innovation and H of a measurement: fixes show the two states, too."""
+    if isinstance(m, GnssPosition):
+        H[:, _SLOW], r = np.eye(2), r - x[_SLOW]
+    return r, H
 
 
 def _both(job: tuple[int, str, int]) -> tuple[float, float, float]:
@@ -79,7 +63,9 @@ def _both(job: tuple[int, str, int]) -> tuple[float, float, float]:
     run = simulate(bl_scenario(case, noise), seed)  # type: ignore[arg-type]
     datum = app.choose_datum(run.recording, run.config)
     honest = compare_to_truth(run_honest(run.recording, run.config, datum).trajectory, run.truth)
-    slow = compare_to_truth(run_slow(run.recording, run.config, datum), run.truth)
+    ekf = SlowEkf(run.recording, run.config)
+    found = run_filter(ekf, run.recording, run.config, datum, _with_error)
+    slow = compare_to_truth(found.trajectory, run.truth)
     assert slow.coverage_95 is not None
     return honest.position_rmse_m, slow.position_rmse_m, slow.coverage_95
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
-from graphloc.graph import Decision
+from graphloc.graph import Decision, Residual
 
 _LOSSES: dict[str, Any] = {
     "huber": gtsam.noiseModel.mEstimator.Huber,
@@ -27,6 +28,13 @@ def with_floors(cov: Array, floors: Array | float) -> Array:
     variances = raised.ravel()[:: len(raised) + 1]
     np.maximum(variances, floors, out=variances)
     return raised
+
+
+def walked(residual: Residual, by: Array | float) -> Residual:
+    """Return a residual with what its slow error walks by between its nodes (k, k)."""
+    cov = residual.cov + by
+    expected = float(np.trace(np.linalg.solve(cov, residual.cov)))
+    return replace(residual, cov=cov, white=residual.cov, expected_nis=expected)
 
 
 def noise_model(cov: Array, decision: Decision) -> Any:

@@ -26,7 +26,7 @@ import numpy as np
 
 from graphloc import gauss
 from graphloc.config import AnyPoseConfig, PoseConfig
-from graphloc.factors._noise import robust, with_floors
+from graphloc.factors._noise import robust, walked, with_floors
 from graphloc.frames import Array, Datum
 from graphloc.graph import Attachment, Decision, FalseModel, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import AXES, PoseFix, PoseMode
@@ -116,14 +116,7 @@ def residuals(m: PoseFix, config: PoseConfig, at: Attachment) -> tuple[Residual,
     found = tuple(with_slow(plain, m.axes, at.slow_value, shown, plain.jacobian()) for plain in found)
     if at.slow_walk is None:
         return found
-    return tuple(_walked(residual, at.walked(shown)) for residual in found)
-
-
-def _walked(residual: Residual, by: Array | float) -> Residual:
-    """Return a residual with what its slow error walks by between its nodes (k, k)."""
-    cov = residual.cov + by
-    expected = float(np.trace(np.linalg.solve(cov, residual.cov)))
-    return replace(residual, cov=cov, white=residual.cov, expected_nis=expected)
+    return tuple(walked(residual, at.walked(shown)) for residual in found)
 
 
 def _slow_axes(config: PoseConfig) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphloc.config import VelocityConfig
-from graphloc.factors._noise import with_floors
+from graphloc.factors._noise import walked, with_floors
 from graphloc.factors._receiver import late_and_off, stamps_and_antenna
 from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Hint, Residual, Sensor, SlowProcess
@@ -58,24 +58,18 @@ def _by_constants(at: Attachment, config: VelocityConfig) -> tuple[Array, ...]:
 
 def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[Residual, ...]:
     """Return predicted - measured (3,), m/s, in world."""
-    raw = _predicted_mps(at, config) - m.v_world_mps
-    white = with_floors(m.cov_m2ps2, config.min_sigma_mps**2)
-    cov = white + at.walked()
-    return (
-        Residual(
-            raw=raw,
-            cov=cov,
-            white=white,
-            jacobian=lambda: _attitude_jacobian(at, config),
-            velocity_jacobian=lambda: np.eye(3),
-            slow_jacobian=lambda: -np.eye(3),
-            constant_jacobians=lambda: _by_constants(at, config),
-            prior=1.0,
-            size_m=None,
-            size_deg=None,
-            expected_nis=float(np.trace(np.linalg.solve(cov, white))),
-        ),
+    plain = Residual(
+        raw=_predicted_mps(at, config) - m.v_world_mps,
+        cov=with_floors(m.cov_m2ps2, config.min_sigma_mps**2),
+        jacobian=lambda: _attitude_jacobian(at, config),
+        velocity_jacobian=lambda: np.eye(3),
+        slow_jacobian=lambda: -np.eye(3),
+        constant_jacobians=lambda: _by_constants(at, config),
+        prior=1.0,
+        size_m=None,
+        size_deg=None,
     )
+    return (walked(plain, at.walked()),)
 
 
 def slow(config: VelocityConfig) -> SlowProcess | None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -131,8 +131,22 @@ class PlanarEkf(Protocol):
         """
 
 
-def run_filter(ekf: PlanarEkf, recording: Recording, config: VesselConfig, datum: Datum) -> FilterResult:
-    """Predict step by step, and apply each measurement at the first step after it."""
+Shown = Callable[[Measurement, Array, Array, Array], tuple[Array, Array]]
+"""Measurement, state, innovation and H without further states -> innovation and H with them."""
+
+
+def run_filter(
+    ekf: PlanarEkf,
+    recording: Recording,
+    config: VesselConfig,
+    datum: Datum,
+    shown: Shown = lambda _m, _x, r, H: (r, H),
+) -> FilterResult:
+    """Predict step by step, and apply each measurement at the first step after it.
+
+    Args:
+        shown: where measurements show states beyond place, velocity and heading.
+    """
     intervals, measured = intervals_of(recording, config, ekf.rate_hz), measurements_of(recording, config)
     x, P = ekf.start(start_of(measured, recording, datum))
     first = intervals[0].stop_ns - round(NS_PER_S / ekf.rate_hz) if intervals else 0
@@ -142,7 +156,7 @@ def run_filter(ekf: PlanarEkf, recording: Recording, config: VesselConfig, datum
         while k < len(measured) and measured[k].m.stamp_ns <= step.stop_ns:
             mounted, k = measured[k], k + 1
             r, planar, R = _measurement(mounted, x[:5], step.rate - (x[5] if len(x) > 5 else 0.0), datum)
-            H = np.hstack([planar, np.zeros((len(r), len(x) - 5))])
+            r, H = shown(mounted.m, x, r, np.hstack([planar, np.zeros((len(r), len(x) - 5))]))
             taken = ekf.gate(mounted.m, r, H, P, R)
             nis = float(r @ np.linalg.solve(H @ P @ H.T + R, r))
             if not isinstance(taken, str):

@@ -175,8 +175,9 @@ def _streams(
             continue
         row, own = by_name[name], by_sensor[name]
         t, R = mount_of(name, config, mounts)
-        slow, left_out, jumps = _slow_and_jumps(row, config, own, problem.datum, company, alone=alone)
-        by_waterline = height_told_better(problem.config, rows, slow_or_left_out(row, config, company)[1])
+        slow, left_out = slow_or_left_out(row, config, company)
+        by_waterline = height_told_better(problem.config, rows, left_out)
+        slow, left_out, jumps = _with_jumps(row, config, own, problem.datum, slow, left_out, alone=alone)
         state, carry = _states_and_carries(own, problem.timeline, problem.links)
         constants, stamps_ns = row.constants(config), stamps_of(own)
         found.append(
@@ -204,11 +205,17 @@ def _streams(
     return tuple(found)
 
 
-def _slow_and_jumps(
-    row: Sensor, config: SensorConfig, measurements: Sequence[Measurement], datum: Datum, company: int, *, alone: bool
+def _with_jumps(
+    row: Sensor,
+    config: SensorConfig,
+    measurements: Sequence[Measurement],
+    datum: Datum,
+    slow: SlowProcess | None,
+    left_out: SlowProcess | None,
+    *,
+    alone: bool,
 ) -> tuple[SlowProcess | None, SlowProcess | None, PositionJumps]:
     """Return `slow`, `left_out` and `position_jumps` of a `Stream`; `alone`: one sensor measures position."""
-    slow, left_out = slow_or_left_out(row, config, company)
     jumps = _NO_JUMPS
     # What a receiver says with and without RTK is told apart by its slow errors, but neither holds the place while the other jumps.
     if alone and (slow is None or config.takes_turns) and row.absolute and row.false is None:
