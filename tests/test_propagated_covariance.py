@@ -37,7 +37,7 @@ def test_a_covariance_is_carried_on_as_errors_are() -> None:
     expected[:6, :6] += noise[:6, :6]
     newest = Newest(
         number=0, stamp_ns=0, pose=here, velocity=v, bias=gtsam.imuBias.ConstantBias(), pose_cov=P[:6, :6],
-        velocity_cov=velocity_cov, gyro_bias_cov=np.zeros((3, 3)),
+        velocity_cov=velocity_cov, bias_cov=np.zeros((6, 6)),
     )  # fmt: skip
     R = there(here, v).rotation().matrix()
     np.testing.assert_allclose(propagated_covariance(P, newest, R, DT_S, noise), expected, atol=1e-6)

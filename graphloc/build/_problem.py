@@ -146,9 +146,12 @@ def with_noise_scale(problem: Problem, noise_scale: float) -> Problem:
 
 def with_imu_noise(problem: Problem, gyro: float, accel: float) -> Problem:
     """Return the problem with the configured noise densities of gyroscope and accelerometer so many times as large."""
-    name = problem.imu.sensor
-    noisier = noisier_imu(problem.config.sensors[name], gyro, accel)
-    return _relinked(problem, problem.config.with_sensors({name: noisier}), problem.noise_scale)
+    return with_imu_scaled(problem, _imu_noise_times(gyro, accel))
+
+
+def with_imu_scaled(problem: Problem, times: Mapping[str, float]) -> Problem:
+    """Return the problem with numbers of the configuration of its IMU so many times as large; `times`: by key."""
+    return _relinked(problem, problem.config.scaled({problem.imu.sensor: times}), problem.noise_scale)
 
 
 def with_sensor_noise(problem: Problem, times: Mapping[str, Mapping[str, float]]) -> Problem:
@@ -160,7 +163,11 @@ def with_sensor_noise(problem: Problem, times: Mapping[str, Mapping[str, float]]
 
 def noisier_imu(sensor: Any, gyro: float, accel: float) -> Any:
     """Return the configuration of an IMU with noise densities so many times as large."""
-    return sensor.scaled({"gyro_noise_mdps_per_sqrt_hz": gyro, "accel_noise_ug_per_sqrt_hz": accel})
+    return sensor.scaled(_imu_noise_times(gyro, accel))
+
+
+def _imu_noise_times(gyro: float, accel: float) -> dict[str, float]:
+    return {"gyro_noise_mdps_per_sqrt_hz": gyro, "accel_noise_ug_per_sqrt_hz": accel}
 
 
 def _relinked(problem: Problem, config: VesselConfig, noise_scale: float) -> Problem:

@@ -77,7 +77,7 @@ def estimate_of(
         R_odom_body=np.array(now.R_odom_body),
         step_cov=odometry.step_cov,
         gyro_radps=gyro,
-        gyro_cov=white + R_body_imu @ newest.gyro_bias_cov @ R_body_imu.T,
+        gyro_cov=white + R_body_imu @ newest.bias_cov[3:, 3:] @ R_body_imu.T,
         accel_bias_mps2=np.asarray(newest.bias.accelerometer()),
         gyro_bias_radps=np.asarray(newest.bias.gyroscope()),
         health=health,

@@ -10,6 +10,7 @@ import numpy as np
 
 from graphloc.build import noisier_imu
 from graphloc.measurements import ImuSeries
+from graphloc.online._bias_walk import BiasWalk
 from graphloc.online._lag import Lag
 from graphloc.solve.imu_noise import CONTRADICTION, LARGEST_NOISE_SCALE, LEAST_TIMES, noise_step, scattered, too_quiet
 
@@ -25,11 +26,12 @@ class ImuNoise:
         adapt: whether they may grow (`adapt_noise`).
 
     Attributes:
-        scale: of both, at least 1. gyro, accel: beside it, of each.
+        scale: of both, at least 1. gyro, accel: beside it, of each. walk: those on the walk of the biases.
     """
 
     def __init__(self, *, adapt: bool) -> None:
         self.scale, self.gyro, self.accel = 1.0, 1.0, 1.0
+        self.walk = BiasWalk()
         self._adapt = adapt
         self._looked_ns, self._misfits, self._weighed_ns = 0, 0, 0
         self._gained = np.zeros(3)  # log-likelihood by a larger noise of both, of the gyroscope, of the accelerometer
@@ -37,16 +39,18 @@ class ImuNoise:
     def begin(self, at_ns: int) -> None:
         """A window has begun at a stamp: it is not checked until it has settled."""
         self._looked_ns, self._misfits, self._weighed_ns = at_ns, 0, at_ns
+        self.walk.begin()
 
-    def at_least(self, scale: float, gyro: float, accel: float) -> None:
+    def at_least(self, scale: float, gyro: float, accel: float, *walk: float) -> None:
         """Raise the factors to those that are known from elsewhere: of a start, or of a snapshot."""
         if not self._adapt:
             return
+        self.walk.times = np.maximum(self.walk.times, walk or 1.0)
         self.scale, self.gyro, self.accel = max(self.scale, scale), max(self.gyro, gyro), max(self.accel, accel)
 
     def of(self, sensor: Any) -> Any:
         """Return the configuration of the IMU with its noise raised but for the scale."""
-        return noisier_imu(sensor, self.gyro, self.accel)
+        return noisier_imu(self.walk.of(sensor), self.gyro, self.accel)
 
     def raised(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
         """Raise the noise where that is needed; return a line on that, or empty.
@@ -57,7 +61,10 @@ class ImuNoise:
         # Until relinearised, the cost of a step includes how far its states have moved since.
         if not self._adapt or not lag.fresh:
             return ""
-        return self._contradicted(lag) or self._too_quiet(lag, samples)
+        said = self.walk.raised(lag, samples) or self._contradicted(lag) or self._too_quiet(lag, samples)
+        if said:
+            self.walk.begin()
+        return said
 
     def _contradicted(self, lag: Lag) -> str:
         """Scale the noise up where the window contradicts the IMU repeatedly, as the batch solver does."""

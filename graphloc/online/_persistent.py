@@ -106,7 +106,7 @@ class PersistentState:
             heights_m=self.heights_m,
             agreed_ns={**self.agreed_ns, **agreed_ns},
             sensor_noise=self.sensor_noise.times,
-            noise=(self.noise.scale, self.noise.gyro, self.noise.accel),
+            noise=(self.noise.scale, self.noise.gyro, self.noise.accel, *self.noise.walk.times.tolist()),
             heading=self.heading,
             p_odom_m=self.odometry.p_m,
             R_odom_body=self.odometry.R,

@@ -19,7 +19,7 @@ from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import ErrorSizes
 from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE
 
-_VERSION = 10
+_VERSION = 11
 # So much is lost where the process is killed: short beside the 20 s that an IMU gap is bridged; a choice.
 _EVERY_S = 2.0
 _MOST_TIMES = 1e4  # of a data sheet's noise, that an IMU on any engine has
@@ -33,7 +33,7 @@ class Snapshot:
         vessel: its name. anchor: the newest state. imu: the sample at it or before.
         datum: origin of world. heights_m: configured heights (m, up in world), by sensor.
         agreed_ns: stamp at which each absolute sensor last agreed. noise: factors on the IMU noise, on that of the gyroscope,
-            and on that of the accelerometer. sensor_noise: those of other sensors' sigmas (`SensorNoise.times`).
+            that of the accelerometer, and the walk of the biases of accelerometers and gyroscopes. sensor_noise: those of other sensors' sigmas (`SensorNoise.times`).
         heading: where no sensor measures it, how far it may be off.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
         clocks_set_ns: by how much the clocks of sensors have been set (`SensorClock`), by sensor.
@@ -47,7 +47,7 @@ class Snapshot:
     datum: Datum
     heights_m: Mapping[str, float]
     agreed_ns: Mapping[str, int]
-    noise: tuple[float, float, float]
+    noise: tuple[float, ...]
     sensor_noise: Mapping[str, Mapping[str, float]]
     heading: UnmeasuredHeading | None
     p_odom_m: Array
@@ -112,7 +112,6 @@ class Snapshot:
             raise ValueError("written by another version of graphloc")
         stamp, *six = raw["imu"]
         p, R = (np.array(raw["odom"][n], dtype=np.float64).reshape(shape) for n, shape in ((0, 3), (1, (3, 3))))
-        scale, gyro, accel = (float(times) for times in raw["noise"])
         sizes = [np.array(of, dtype=np.float64) for of in raw["unmodelled"] or ()]
         found = cls(
             vessel=str(raw["vessel"]),
@@ -121,7 +120,7 @@ class Snapshot:
             datum=Datum(Geodetic(*(float(v) for v in raw["datum"]))),
             heights_m={str(n): float(h) for n, h in raw["heights_m"].items()},
             agreed_ns={str(n): int(s) for n, s in raw["agreed_ns"].items()},
-            noise=(scale, gyro, accel),
+            noise=tuple(float(times) for times in raw["noise"]),
             sensor_noise={
                 str(name): {str(key): float(by) for key, by in times.items()}
                 for name, times in raw["sensor_noise"].items()
@@ -152,7 +151,7 @@ class Snapshot:
                 [] if heading is None else [heading.since_ns, heading.sigma_rad, heading.drift_radps],
             ]
         )
-        finite = bool(np.isfinite(numbers).all())
+        finite = len(self.noise) == 5 and bool(np.isfinite(numbers).all())
         noise = 1.0 <= min(raised) and scale <= LARGEST_NOISE_SCALE and max(raised) <= _MOST_TIMES
         return finite and noise and bool(np.abs(R @ R.T - np.eye(3)).max() <= 1e-3)
 

@@ -36,7 +36,7 @@ class Newest:
     Attributes:
         number: in the timeline. pose, velocity: at the IMU with the body's axes, in world: gtsam.Pose3 and (3,), m/s.
         bias: of the IMU. pose_cov: (6, 6), rotation first, in the body tangent. velocity_cov: (3, 3), in world.
-        gyro_bias_cov: (3, 3), in the IMU's axes.
+        bias_cov: (6, 6), accelerometers first, in the IMU's axes.
     """
 
     number: int
@@ -46,7 +46,7 @@ class Newest:
     bias: gtsam.imuBias.ConstantBias
     pose_cov: Array
     velocity_cov: Array
-    gyro_bias_cov: Array
+    bias_cov: Array
 
     @property
     def unsure(self) -> bool:
@@ -141,7 +141,7 @@ class States:
             bias=values.atConstantBias(keys.bias(timeline.slow_of[k])),
             pose_cov=self._window.covariance([keys.pose(k)]),
             velocity_cov=self._window.covariance([keys.velocity(k)]),
-            gyro_bias_cov=self._window.covariance([keys.bias(timeline.slow_of[k])])[3:, 3:],
+            bias_cov=self._window.covariance([keys.bias(timeline.slow_of[k])]),
         )
         arrays = (newest.pose.matrix(), newest.velocity, newest.bias.vector(), newest.pose_cov, newest.velocity_cov)
         if not all(np.isfinite(a).all() for a in arrays) or min(np.diagonal(newest.pose_cov)) <= 0.0:

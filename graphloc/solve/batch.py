@@ -39,12 +39,13 @@ from graphloc.solve._marginals import marginals
 from graphloc.solve._passes import cost_of_run, cost_without_outliers, rough_passes
 from graphloc.solve._returns import doubtful_returns
 from graphloc.solve._start import Begun
+from graphloc.solve.bias_walk import with_needed_walk
 from graphloc.solve.decide import Stage, Verdicts
 from graphloc.solve.imu_mount import MountError, with_mount_estimated
 from graphloc.solve.imu_noise import CONTRADICTION, noise_step, with_needed_noise
 from graphloc.solve.sensor_noise import scattering
 
-_MAX_NOISE_ROUNDS, _MAX_JUMP_ROUNDS = 4, 2
+_MAX_NOISE_ROUNDS, _MAX_JUMP_ROUNDS, _MAX_WALK_ROUNDS = 4, 2, 2
 # Nats by which each jump must make a run more probable: which of a thousand fixes it is at and what it leads to, of a hundred places
 # along each axis, are worth 16; in 25 of 27 runs with jumps each did by over 30, between high houses, where fixes wander, by 15 to 20.
 _OF_A_JUMP = 25.0
@@ -102,6 +103,7 @@ def solve_batch(
         SolveError: it could not be started, or the linear algebra failed.
     """
     run = _Underway(problem, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
+    run.raise_bias_walk()
     run.raise_noise_of_sensors()
     if not newest:
         run.take_jumps()
@@ -158,6 +160,18 @@ class _Underway:
     def stated(self) -> Problem:
         """The problem as configured, with the position jumps that were found."""
         return with_jumps_of(self._problem, self._configured)
+
+    def raise_bias_walk(self) -> None:
+        """Solve it anew where the biases of the IMU wander by more than configured: the track is bent, and right hypotheses seem false."""
+        for _ in range(_MAX_WALK_ROUNDS):
+            problem, settled = self.solved
+            if not problem.config.sensors[problem.imu.sensor].adapt_noise:
+                return
+            wandering = with_needed_walk(problem, settled.values, settled.verdicts, self.begun.prior)
+            if wandering is None:
+                return
+            del self.solved, settled  # and its graph, before the next one is made
+            self._solve_first(replace(wandering, usual_motion=None))
 
     def raise_noise_of_sensors(self) -> None:
         """Solve it anew where sensors that scatter more than they state may have misled a start by the motion alone.

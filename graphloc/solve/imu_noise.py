@@ -26,6 +26,8 @@ from graphloc.solve.linearised import linearised, normal_solver, normal_solver_a
 
 Solved = tuple[Any, Array, Callable[[Array], Array]]
 """J, weighted; residuals (rows,); and the solution of J'J x = y."""
+Parts = tuple[NDArray[np.intp], ...]
+"""Rows of each part of a system."""
 
 _DRAWS = 16  # random vectors for the estimate of a trace
 _NOISE_ROUNDS, _LEAST_FREEDOM, _UNLIKELY = 5, 3.0, 1e-4
@@ -60,8 +62,6 @@ def imu_misfit(
 ) -> ImuMisfit:
     """Return the misfit of gyroscope and accelerometer, and by what factor other noise would explain it.
 
-    With other noise the share of the other sensors changes, so the factor is found in some rounds (variance components, Helmert).
-
     Args:
         unweighted, b: J (rows, columns) and right side (rows,) before weighting. root: (rows,) of the weights.
         solved: the run with these. links: the number of IMU factors, which come first, nine rows each: attitude (gyroscope), position,
@@ -69,35 +69,53 @@ def imu_misfit(
         most: largest factors that are looked for; 1: only whether the noise is smaller.
     """
     rows = np.arange(9 * links).reshape(-1, 9)
-    own, needed = (rows[:, :3].ravel(), rows[:, 3:].ravel()), np.ones(2)
-    squares, freedom = first = _squares_and_freedom(solved, own)
+    own = rows[:, :3].ravel(), rows[:, 3:].ravel()
+    squares, freedom = squares_and_freedom(solved, own)
     low = np.array([f > _LEAST_FREEDOM and chdtr(f, s) < _UNLIKELY for s, f in zip(squares, freedom, strict=True)])
     high = np.array([chdtrc(max(f, 0.1), s) < _UNLIKELY_IF_SCATTERED for s, f in zip(squares, freedom, strict=True)])
     high &= np.array(most) > 1.0
-    follow = low | high
-    for _ in range(_NOISE_ROUNDS if follow.any() else 0):
-        step = np.sqrt(squares / np.maximum(freedom, 1e-9))
-        needed[low] *= np.clip(step, 0.3, 1.2)[low]
-        needed[high] *= np.clip(step, 0.3, _MOST_STEP)[high]
-        needed = np.minimum(needed, np.maximum(most, 1.0))
-        scaled = root.copy()
-        for part, times in zip(own, needed, strict=True):
-            scaled[part] /= times
-        J = diags_array(scaled) @ unweighted
-        solve = normal_solver(J)
-        squares, freedom = _squares_and_freedom((J, scaled * b - J @ solve(J.T @ (scaled * b)), solve), own)
-    sigma = needed / np.sqrt(2.0 * np.maximum(freedom, 1.0))
+    needed, left = components((unweighted, root, b), own, (squares, freedom), low, high, most)
+    sigma = needed / np.sqrt(2.0 * np.maximum(left, 1.0))
     return ImuMisfit(
         *(
-            Misfit(
-                squares=float(first[0][k]), freedom=float(first[1][k]), needed=float(needed[k]), sigma=float(sigma[k])
-            )
+            Misfit(squares=float(squares[k]), freedom=float(freedom[k]), needed=float(needed[k]), sigma=float(sigma[k]))
             for k in range(2)
         )
     )
 
 
-def _squares_and_freedom(solved: Solved, parts: tuple[NDArray[np.intp], ...]) -> tuple[Array, Array]:
+def components(
+    system: tuple[Any, Array, Array],
+    parts: Parts,
+    found: tuple[Array, Array],
+    low: NDArray[np.bool_],
+    high: NDArray[np.bool_],
+    most: Sequence[float],
+) -> tuple[Array, Array]:
+    """Return by what factor the noise of parts of the rows explains their residuals, and the freedom that they have with it.
+
+    With other noise the share of the other rows changes, so the factor is found in some rounds (variance components, Helmert).
+
+    Args:
+        system: J (rows, columns), root of the weights (rows,), b (rows,) before weighting. found: `squares_and_freedom` with these.
+        low, high: of each part, whether less is looked for, or more, at most `most` times as much.
+    """
+    (unweighted, root, b), (squares, freedom), needed = system, found, np.ones(len(parts))
+    for _ in range(_NOISE_ROUNDS if (low | high).any() else 0):
+        step = np.sqrt(squares / np.maximum(freedom, 1e-9))
+        needed[low] *= np.clip(step, 0.3, 1.2)[low]
+        needed[high] *= np.clip(step, 0.3, _MOST_STEP)[high]
+        needed = np.minimum(needed, np.maximum(most, 1.0))
+        scaled = root.copy()
+        for part, times in zip(parts, needed, strict=True):
+            scaled[part] /= times
+        J = diags_array(scaled) @ unweighted
+        solve = normal_solver(J)
+        squares, freedom = squares_and_freedom((J, scaled * b - J @ solve(J.T @ (scaled * b)), solve), parts)
+    return needed, freedom
+
+
+def squares_and_freedom(solved: Solved, parts: Parts) -> tuple[Array, Array]:
     """Squared residuals of parts of the rows, and the trace of 1 - J (J'J)^-1 J' over each (Hutchinson, random signs)."""
     rng, (J, r, solve) = np.random.default_rng(0), solved
     signs = [rng.choice(np.array([-1.0, 1.0]), (len(part), _DRAWS)) for part in parts]

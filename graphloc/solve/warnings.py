@@ -20,6 +20,7 @@ from graphloc.solution import CONTRADICTING_COST, Graded, SolveStats
 from graphloc.solve._lasting import lasting
 from graphloc.solve._passes import expected_cost
 from graphloc.solve.batch import BatchResult
+from graphloc.solve.bias_walk import KEYS, WANDERS_S, too_steady, walk_times, wandered
 from graphloc.solve.decide import AGREES, Verdict
 from graphloc.solve.health import FAR_OFF, late_of
 from graphloc.solve.imu_mount import MountError, mount_sigma_rad
@@ -32,7 +33,6 @@ _SMALL_M = 0.1  # a slow error below it is that of RTK
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
 _BY_CHANCE = 1e-3  # anywhere in the run; a choice
 _UNAIDED_S = 30.0  # at an end of the run, from which the IMU alone is metres off
-_WANDERS_S = 60.0  # over which it is looked at how far a bias has gone
 _WANDERS = 4.0  # sigmas of its random walk over that: smoothed, a bias that walks so moves by less than two
 _LEVELS_M = 0.5  # sigma, for levels that may be the usual ones as well: said from there on
 
@@ -242,27 +242,19 @@ def _unaided_ends(problem: Problem) -> list[str]:
 
 
 def _wandering_biases(problem: Problem, result: BatchResult) -> list[str]:
-    """Return a line on biases that wander by far more than their random walk allows, as those of a cheap IMU that warms up do.
+    """Return a line on biases that wander by far more than their random walk allows, where that is not to be raised.
 
     Axes that gravity shows tell it. The rate about the vertical wanders as much, unseen where nothing measures the heading.
     """
-    nodes, first = np.unique(problem.timeline.slow_of, return_index=True)
-    t_s = (problem.timeline.stamps_ns[first] - problem.timeline.stamps_ns[0]) / NS_PER_S
-    later = np.searchsorted(t_s, t_s + _WANDERS_S)
-    begin = np.flatnonzero(later < len(t_s))
-    if not len(begin):
-        return []
-    of = [result.values.atConstantBias(keys.bias(int(j))) for j in nodes]
-    bias = np.array([np.concatenate([b.accelerometer(), b.gyroscope()]) for b in of])
-    walked = np.abs(bias[later[begin]] - bias[begin]).max(axis=0) / problem.links.bias_steps(_WANDERS_S)
-    walked /= max(result.noise_scale, 1.0)  # with which it was solved
     config, warnings = problem.config.sensors[problem.imu.sensor], list[str]()
-    for what, key, times, bounds in (
-        ("accelerometers", "accel_bias_instability_ug", walked[:3].max(), "roll, pitch and position"),
-        ("gyroscopes", "gyro_bias_instability_deg_per_h", walked[3:].max(), "the heading"),
+    if config.adapt_noise:
+        return []
+    every = wandered(problem, result.values)
+    for times, what, key, bounds in zip(
+        every, ("accelerometers", "gyroscopes"), KEYS, ("roll, pitch and position", "the heading"), strict=True
     ):
         if times > _WANDERS:
-            said = f"{problem.imu.sensor}: a bias of its {what} changes within {_WANDERS_S:.0f} s by {times:.1f} sigmas of what {key} allows"
+            said = f"{problem.imu.sensor}: a bias of its {what} changes within {WANDERS_S:.0f} s by {times:.1f} sigmas of what {key} allows"
             cure = f"it warms up, or is a cheap one; set {key}: {float(f'{times * getattr(config, key):.2g}'):g} or more, until this line is gone: else the bounds of {bounds} are too small"
             warnings.append(Graded(f"{said}: {cure}", f"wandering {what}", float(times)))
     return warnings
@@ -298,6 +290,9 @@ def noise_warnings(problem: Problem, result: BatchResult) -> list[str]:
             taken[name].accel_noise_mps2 / stated[name].accel_noise_mps2,
         )
         warnings.append(Graded(said, "IMU noise by its samples", max(times)))
+    if said := too_steady(name, stated[name], taken[name]):
+        raised = walk_times(stated[name], taken[name])
+        warnings.append(Graded(said, "walk of the IMU's biases", max(raised.values())))
     return warnings
 
 

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Biases of an IMU that wander by more than configured: one that warms up, or a cheap one."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from graphloc import app
+from graphloc.config import ImuConfig
+from graphloc.eval.simulate import Scenario, SimulatedRun
+from graphloc.frames import Array, wrap_angle
+from graphloc.online._bias_walk import BiasWalk
+from graphloc.replay import replay
+from graphloc.solution import Solution
+from tests.slowly import simulate_slowly
+
+SECOND = 1_000_000_000
+IMU = ImuConfig.model_validate({"topic": "/imu"})
+RUN = Scenario(path="loops", duration_s=90.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0)
+
+
+def with_gyro_bias(run: SimulatedRun, bias_radps: Array) -> SimulatedRun:
+    """The run with this (N, 3) on its gyroscopes."""
+    imu = run.recording.imu
+    assert imu is not None
+    return replace(run, recording=replace(run.recording, imu=replace(imu, gyro_radps=imu.gyro_radps + bias_radps)))
+
+
+def with_imu(run: SimulatedRun, **settings: object) -> SimulatedRun:
+    imu = run.config.sensors["imu"].model_copy(update=settings)
+    return replace(run, config=run.config.with_sensors({"imu": imu}))
+
+
+@pytest.fixture(scope="module")
+def cold() -> SimulatedRun:
+    return simulate_slowly(RUN, 1)
+
+
+@pytest.fixture(scope="module")
+def warm(cold: SimulatedRun) -> SimulatedRun:
+    """Its bias settles by 0.3 deg/s in a minute, by fifty times what is configured."""
+    imu = cold.recording.imu
+    assert imu is not None
+    settles = np.radians(0.3) * np.exp(-(imu.stamps_ns - imu.stamps_ns[0]) * 1e-9 / 40.0)
+    return with_gyro_bias(cold, settles[:, None] * [0.5, -0.5, 0.7])
+
+
+def heading(run: SimulatedRun, solution: Solution) -> tuple[float, float]:
+    """Largest error of the heading, deg, and the share inside its bounds."""
+    track = solution.trajectory
+    assert track.cov is not None
+    off = np.abs(wrap_angle(track.yaw_rad - run.truth.at(track.stamps_ns).yaw_rad))
+    return float(np.degrees(off.max())), float(np.mean(off < 1.96 * np.sqrt(track.cov[:, 5, 5])))
+
+
+def lines(solution: Solution) -> list[str]:
+    return [w for w in solution.stats.warnings if "biases change more" in w or "changes within" in w]
+
+
+def test_a_gyroscope_that_warms_up_keeps_its_heading(cold: SimulatedRun, warm: SimulatedRun) -> None:
+    """Held to its configured walk, its heading was beyond its bounds most of the time."""
+    steady = smooth_run(cold)
+    assert not lines(steady)
+    found = smooth_run(warm)
+    (said,) = lines(found)
+    assert "gyro_bias_instability_deg_per_h is 20, " in said
+    off_deg, inside = heading(warm, found)
+    assert off_deg < 1.0
+    assert inside > 0.9
+
+
+def test_a_walk_that_is_not_to_be_raised_is_said(warm: SimulatedRun) -> None:
+    held = with_imu(warm, adapt_noise=False)
+    found = smooth_run(held)
+    (said,) = lines(found)
+    assert "a bias of its gyroscopes changes within 60 s by" in said
+    assert float(said.split("set gyro_bias_instability_deg_per_h: ")[1].split(" ")[0]) > 4.0 * 20.0
+    off_deg, inside = heading(held, found)
+    assert (off_deg > 2.0, inside < 0.5) == (True, True), (off_deg, inside)
+    assert not lines(smooth_run(with_imu(held, gyro_bias_instability_deg_per_h=600.0)))
+
+
+def smooth_run(run: SimulatedRun) -> Solution:
+    return app.smooth_recording(run.recording, run.config).solution
+
+
+@pytest.mark.parametrize("times", [10.0, 30.0])
+def test_the_walk_is_found_as_it_is(cold: SimulatedRun, times: float) -> None:
+    """A random walk of so many times the configured density."""
+    imu, sensor = cold.recording.imu, cold.config.sensors["imu"]
+    assert imu is not None
+    steps = np.random.default_rng(5).standard_normal((len(imu), 3)) * sensor.gyro_bias_walk_radps * np.sqrt(1.0 / 50.0)
+    (said,) = lines(smooth_run(with_gyro_bias(cold, times * np.cumsum(steps, axis=0))))
+    assert "accel" not in said
+    taken = float(said.split("is 20, ")[1].split(" ")[0]) / sensor.gyro_bias_instability_deg_per_h
+    assert 0.5 * times < taken < 2.0 * times
+
+
+def test_online_the_walk_is_raised_under_way(cold: SimulatedRun, warm: SimulatedRun) -> None:
+    steady, found = (replay(run.recording, run.config).solution for run in (cold, warm))
+    assert not lines(steady)
+    assert "gyro_bias_instability_deg_per_h is 20, " in lines(found)[-1]
+    late = found.trajectory.where(found.trajectory.stamps_ns > found.trajectory.stamps_ns[0] + 60 * SECOND)
+    off = np.abs(wrap_angle(late.yaw_rad - warm.truth.at(late.stamps_ns).yaw_rad))
+    assert np.degrees(off.max()) < 1.0
+
+
+# A Kalman filter of six biases, each measured once a second
+
+
+def filtered(walk: BiasWalk, times: Array, seconds: int, rng: Any) -> list[str]:
+    """What is said of an estimate of biases (6,) that walk `times` as much as configured, filtered as if with the walk that is taken."""
+    true, b, P = np.zeros(6), np.zeros(6), np.full(6, 1e-6)
+    configured = np.array([IMU.accel_bias_walk_mps2] * 3 + [IMU.gyro_bias_walk_radps] * 3)
+    measured, said = 3.0 * configured, []
+    config = SimpleNamespace(sensors={"imu": IMU})
+    for k in range(seconds):
+        taken = configured * np.repeat(walk.times, 3)
+        true = true + times * configured * rng.standard_normal(6)
+        gain = (P + taken**2) / (P + taken**2 + measured**2)
+        b = b + gain * (true + measured * rng.standard_normal(6) - b)
+        P = (1.0 - gain) * (P + taken**2)
+        newest = SimpleNamespace(
+            stamp_ns=k * SECOND, pose=gtsam.Pose3(), pose_cov=np.eye(6) * 1e-4, bias_cov=np.diag(P),
+            bias=gtsam.imuBias.ConstantBias(b[:3], b[3:]),
+        )  # fmt: skip
+        links = SimpleNamespace(bias_steps=lambda dt_s, taken=taken: taken * np.sqrt(dt_s))
+        lag: Any = SimpleNamespace(newest=newest, problem=SimpleNamespace(links=links, config=config))
+        if line := walk.raised(lag, lambda: SimpleNamespace(sensor="imu")):  # type: ignore[arg-type,return-value]
+            said.append(line)
+            walk.begin()
+    return said
+
+
+def test_a_walk_as_configured_is_never_raised() -> None:
+    """Three hours of six biases."""
+    walk = BiasWalk()
+    assert not filtered(walk, np.ones(6), 3 * 3600, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("part", [0, 1])
+def test_the_walk_is_raised_to_what_it_is(part: int) -> None:
+    walk, rng, times = BiasWalk(), np.random.default_rng(2), np.ones(6)
+    times[3 * part : 3 * part + 3] = 20.0
+    (said, *_) = filtered(walk, times, 600, rng)
+    assert ("gyro" in said) == (part == 1)
+    assert 8.0 < walk.times[part] < 40.0
+    assert walk.times[1 - part] < 1.5
+
+
+def test_where_the_heading_is_hardly_known_nothing_is_told() -> None:
+    """It turns the biases of the accelerometers with it."""
+    walk, links = BiasWalk(), SimpleNamespace(bias_steps=lambda dt_s: np.full(6, 1e-5))
+    for k in range(10):
+        newest = SimpleNamespace(
+            stamp_ns=10 * k * SECOND, pose=gtsam.Pose3(), pose_cov=np.diag([1e-4, 1e-4, 0.1, 1.0, 1.0, 1.0]),
+            bias=gtsam.imuBias.ConstantBias(np.full(3, float(k)), np.zeros(3)), bias_cov=np.eye(6) * 1e-8,
+        )  # fmt: skip
+        lag: Any = SimpleNamespace(newest=newest, problem=SimpleNamespace(links=links))
+        assert not walk.raised(lag, lambda: pytest.fail("asked for samples"))
