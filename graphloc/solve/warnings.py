@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build import CONSTANT_TAILS, Problem, Stream, solved_constants
+from graphloc.build import Problem, Stream, solved_constants
 from graphloc.config import SIGMA_SCALES, PoseConfig, SensorConfig
 from graphloc.frames import Array
-from graphloc.graph import TIME_OFFSET, Constant, SlowProcess, corrections
+from graphloc.graph import CONSTANT_TAILS, TIME_OFFSET, Constant, SlowProcess, corrections
 from graphloc.signals.position_jumps import jump_warnings, largest_sigma
 from graphloc.signals.series import runs
 from graphloc.solution import CONTRADICTING_COST, Graded, SolveStats
