@@ -98,6 +98,11 @@ class Attachment:
     constants: tuple[tuple[int, Array], ...] = ()
     T_solver: Any | None = None
     felt: FeltMotion | None = None
+    own: tuple[tuple[int, ...], ...] = ()
+
+    def own_of(self, n: int) -> tuple[int, ...]:
+        """Return which rows of constant `n` the sensor's measurements have; none: all (`Constant.own`)."""
+        return self.own[n] if n < len(self.own) else ()
 
     def walked(self, shown: Array | None = None) -> Array | float:
         """Return the covariance (k, k) that `slow_walk` adds to a measurement; 0 where there is no slow state.
@@ -281,11 +286,20 @@ class Constant:
     Attributes:
         name: for warnings. sigma: (k,).
         corrects: for each of the k, the key of vessel.yaml that it is added to, in its unit; none for what was surveyed.
+        own: which of the k this sensor's measurements have, where it shares it with other sensors; none: all.
+        of_another: how many, from the first on, another sensor has too, which says them.
     """
 
     name: str
     sigma: Array
     corrects: tuple[str, ...] = ()
+    own: tuple[int, ...] = ()
+    of_another: int = 0
+
+    @property
+    def settings(self) -> list[tuple[int, str]]:
+        """Number and key of each setting of this sensor that it corrects."""
+        return [(n, key) for n, key in enumerate(self.corrects) if not self.own or n in self.own]
 
     def widened(self, value: Array) -> Array:
         """Return the sigmas (k,) of its prior re-weighted at an estimate (k,): it has the tails of Student's t.
@@ -313,7 +327,7 @@ class Constant:
 
 def corrections(solved: Iterable[tuple[Constant, Array]], mount: Any) -> dict[str, float]:
     """Return what the estimate of a sensor's constants adds to its settings, by their keys; a place is turned into the axes of its mount (gtsam.Pose3)."""
-    found = {key: float(by) for constant, value in solved for key, by in zip(constant.corrects, value, strict=False)}
+    found = {key: float(value[n]) for constant, value in solved for n, key in constant.settings}
     if PLACE[0] in found:
         off_m = mount.rotation().matrix() @ np.array([found[key] for key in PLACE])
         found |= zip(PLACE, off_m.tolist(), strict=True)

@@ -147,19 +147,15 @@ class Constants:
                 yield constant, self._known[key].value
 
     def far_off(self, stream: LiveStream) -> Iterator[tuple[str, float, str]]:
-        """Yield each setting of a stream that is clearly far from where the window has it, by how much, and a line on that.
-
-        Of what it shares another sensor says it.
-        """
-        if stream.shares is not None:
-            return
+        """Yield each setting of a stream that is clearly far from where the window has it, by how much, and a line on that."""
         for constant, key in zip(stream.constants, constant_keys(stream), strict=True):
             if constant.corrects and self._window.is_committed(key):
                 value = self._window.values.atVector(key)
                 for setting, by, said in far_off(stream.name, constant, value, stream.mount):
                     sigma = np.sqrt(np.diag(self._window.covariance([key])))
                     # Of a place the largest: a mount may turn its axes.
-                    unsure = sigma[-3:].max() if setting in PLACE else sigma[constant.corrects.index(setting)]
+                    same = PLACE if setting in PLACE else (setting,)
+                    unsure = max(sigma[n] for n, key_of in constant.settings if key_of in same)
                     if abs(by) > FAR_OFF * unsure:
                         yield setting, by, said
 
