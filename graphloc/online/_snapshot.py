@@ -19,7 +19,7 @@ from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import ErrorSizes
 from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE
 
-_VERSION = 10
+_VERSION = 11
 # So much is lost where the process is killed: short beside the 20 s that an IMU gap is bridged; a choice.
 _EVERY_S = 2.0
 _MOST_TIMES = 1e4  # of a data sheet's noise, that an IMU on any engine has
