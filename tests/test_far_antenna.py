@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from graphloc.blocks import MountConfig
 from graphloc.build import rows_of, shared_constants
@@ -29,7 +30,7 @@ from tests.test_late_fixes import SCENARIO, solved
 from tests.test_online_faults import smoother
 
 OFF_M = (0.9, -0.6, 1.2)
-CALM = replace(SCENARIO, path="straight", wave_roll_deg=4.0, wave_pitch_deg=3.0, gnss_sigma_m=0.5)
+CALM = replace(SCENARIO, path="still", wave_roll_deg=4.0, wave_pitch_deg=3.0, gnss_sigma_m=0.5)
 
 
 def far_m(found: Array) -> float:
@@ -101,6 +102,13 @@ def test_else_each_has_its_own(of_velocity: dict[str, Any]) -> None:
     assert (len(constant.sigma), constant.own, shares) == (4, (), None)
 
 
+def test_of_a_receiver_that_is_off_there_is_no_place_to_share() -> None:
+    config = config_of(antenna="gnss", stamp_sigma_s=0.2)
+    off = config.with_sensors({"gnss": config.sensors["gnss"].model_copy(update={"enabled": False})})
+    constant, shares = constants_of(off, "v")
+    assert (len(constant.sigma), constant.own, shares) == (4, (), None)
+
+
 def test_it_sits_where_that_sensor_does() -> None:
     fixes = GnssConfig(topic="/fix", mount_sigma_m=1.5, mount=MountConfig(xyz_m=(1.0, 2.0, 3.0)))
     config = VesselConfig(sensors={"gnss": fixes, "v": VelocityConfig(topic="/vel", antenna="gnss")})
@@ -134,8 +142,8 @@ def test_factors_of_one_antenna_have_its_place_alone_in_common() -> None:
 
 
 @cache
-def with_velocities(antenna: str, late_s: float = 0.0) -> SimulatedRun:
-    """A run on a straight course through waves, fixes of a metre: their antenna is 1.6 m off, which their velocities tell."""
+def with_velocities(antenna: str) -> SimulatedRun:
+    """A vessel that lies in waves, with fixes of half a metre: their antenna is 1.6 m off, which its velocities tell, 0.08 s late."""
     run = displaced(0.5, OFF_M, CALM)
     fixes = run.config.sensors["gnss"]
     assert isinstance(fixes, GnssConfig)
@@ -143,11 +151,11 @@ def with_velocities(antenna: str, late_s: float = 0.0) -> SimulatedRun:
     stamps = np.array([m.stamp_ns for m in own])
     lever = np.array(fixes.mount.xyz_m) + OFF_M
 
-    def antenna_at(at_ns: Array) -> Array:
+    def antenna_at(at_ns: NDArray[np.int64]) -> Array:
         body = run.truth.at(at_ns)
         return np.asarray(body.p_world_m + np.einsum("nij,j->ni", body.R_world_body, lever))
 
-    step, past = 50_000_000, round(late_s * 1e9)
+    step, past = 50_000_000, 80_000_000
     inside = stamps[(stamps > run.truth.stamps_ns[0] + step + past) & (stamps < run.truth.stamps_ns[-1] - step)]
     v = (antenna_at(inside - past + step) - antenna_at(inside - past - step)) / (2e-9 * step)
     v += np.random.default_rng(5).normal(0.0, 0.02, v.shape)
@@ -174,7 +182,7 @@ def online(run: SimulatedRun) -> Array:
 
 @pytest.mark.parametrize("mode", [partial(offline), partial(online)], ids=["offline", "online"])
 def test_velocities_tell_where_the_antenna_of_the_fixes_is(mode: Callable[[SimulatedRun], Array]) -> None:
-    """Along the course nothing else does."""
+    """Where nothing turns nothing else does."""
     apart, together = far_m(mode(with_velocities(""))), far_m(mode(with_velocities("gnss")))
-    assert together < 0.5
-    assert apart > 2.0 * together
+    assert together < 0.1
+    assert apart > 1.0
