@@ -29,6 +29,7 @@ def late_and_off(at: Attachment, config: GnssConfig | VelocityConfig) -> tuple[f
     """Return the estimates of both, s and m, the latter in the antenna's axes; zero where they are not estimated."""
     if not at.constants:  # of a sensor with none, or taken as configured to examine that
         return 0.0, _NOT_OFF
-    value = at.constants[0][1]
+    value, own = at.constants[0][1], at.own_of(0)
+    value = value[list(own)] if own else value
     late = float(value[0]) if config.stamp_sigma_s > 0.0 else 0.0
     return late, value[-3:] if config.mount_sigma_m > 0.0 else _NOT_OFF

@@ -306,5 +306,6 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         slow_error=not precise,
         by_turns=_by_turns(stamps[~bad], own, rows[~bad], known[~bad], sigmas[~bad], fixed[~bad]),
         why=why,
+        frame_id=fixes.frame_id,
         tf_frame=tf_frame,
     )

@@ -164,6 +164,7 @@ def velocity_report(
         msgtype=stream.msgtype,
         axes=axes,
         why=f"{why}; {_REVERSED}" if reverse else why,
+        frame_id=stream.frame_id,
         tf_frame=None if pose is None else stream.frame_id,
         reverse=reverse,
         mount=_mount_of_log(stream.frame_id, pose, reverse) if log else None,

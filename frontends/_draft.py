@@ -516,9 +516,23 @@ def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None, o
         lines += _filtered_lines(twist.topic)
     if twist.axes == NORTH_AXES:
         lines.append("  convention: ned  # guess: by the GNSS track")
+    if (said := _of_antenna(twist, gnss)) is not None:
+        return [*lines, f"  antenna: {_numbered('gnss', 0)}  # guess: {said}; it sits where that does"]
     frame = twist.tf_frame or (gnss.tf_frame if gnss else None)
     evidence = "from tf" if twist.tf_frame else "guess: the antenna of the GNSS receiver"
     return [*lines, *_antenna_lines(frame, evidence, gnss.keeps_m if gnss else 0.0)]
+
+
+def _of_antenna(twist: VelocityReport, gnss: GnssReport | None) -> str | None:
+    """Return what tells that a velocity is of the antenna of a receiver of which nothing tells the place; None: nothing does.
+
+    A filter's output is of another place than the fixes that went into it.
+    """
+    if gnss is None or gnss.tf_frame or twist.tf_frame or filtered(gnss.topic) != filtered(twist.topic):
+        return None
+    if gnss.topic.partition(" ")[0] == twist.topic.partition(" ")[0]:
+        return "of the same topic"
+    return f"both have the frame '{twist.frame_id}'" if twist.frame_id and twist.frame_id == gnss.frame_id else None
 
 
 def _antenna_lines(frame: str | None, evidence: str, keeps_m: float) -> list[str]:

@@ -194,6 +194,7 @@ class GnssReport:
     first: Vec
     slow_error: bool
     why: str
+    frame_id: str = ""
     tf_frame: str | None = None
     white_m: float | None = None
     frozen: str = ""
@@ -285,6 +286,7 @@ class VelocityReport:
     axes: str | None
     why: str
     tf_frame: str | None
+    frame_id: str = ""
     late_s: tuple[float, float] | None = None
     late_with_fixes: bool = False
     reverse: bool = False

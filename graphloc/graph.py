@@ -98,6 +98,11 @@ class Attachment:
     constants: tuple[tuple[int, Array], ...] = ()
     T_solver: Any | None = None
     felt: FeltMotion | None = None
+    own: tuple[tuple[int, ...], ...] = ()
+
+    def own_of(self, n: int) -> tuple[int, ...]:
+        """Return which rows of constant `n` the sensor's measurements have; none: all (`Constant.own`)."""
+        return self.own[n] if n < len(self.own) else ()
 
     def walked(self, shown: Array | None = None) -> Array | float:
         """Return the covariance (k, k) that `slow_walk` adds to a measurement; 0 where there is no slow state.
@@ -268,6 +273,8 @@ class SlowProcess:
         return kept, self.sigma**2 * (1.0 - kept**2)
 
 
+CONSTANT_TAILS = 9.0
+"""Squared sigmas at which the variance of a constant's prior doubles."""
 TIME_OFFSET = "time_offset_s"
 PLACE = ("mount.xyz_m[0]", "mount.xyz_m[1]", "mount.xyz_m[2]")
 
@@ -279,16 +286,48 @@ class Constant:
     Attributes:
         name: for warnings. sigma: (k,).
         corrects: for each of the k, the key of vessel.yaml that it is added to, in its unit; none for what was surveyed.
+        own: which of the k this sensor's measurements have, where it shares it with other sensors; none: all.
+        of_another: how many, from the first on, another sensor has too, which says them.
     """
 
     name: str
     sigma: Array
     corrects: tuple[str, ...] = ()
+    own: tuple[int, ...] = ()
+    of_another: int = 0
+
+    @property
+    def settings(self) -> list[tuple[int, str]]:
+        """Number and key of each setting of this sensor that it corrects."""
+        return [(n, key) for n, key in enumerate(self.corrects) if not self.own or n in self.own]
+
+    def widened(self, value: Array) -> Array:
+        """Return the sigmas (k,) of its prior re-weighted at an estimate (k,): it has the tails of Student's t.
+
+        With a Gaussian one, a tag that was surveyed 0.5 m wrong pulls two good ones along (error at the berth 0.5 m; 0.05 m with tails).
+        """
+        return self.sigma * np.sqrt(1.0 + self._squares(value) / CONSTANT_TAILS)
+
+    def cost(self, value: Array) -> float:
+        """Return -log of how probable a value (k,) is, but for a constant."""
+        squares = self._squares(value)
+        together = ~self._alone
+        costs = np.append(squares[~together], squares[together][:1])
+        return 0.5 * CONSTANT_TAILS * float(np.log1p(costs / CONSTANT_TAILS).sum())
+
+    @property
+    def _alone(self) -> NDArray[np.bool_]:
+        """Which of the k have tails of their own: that an antenna sits far off says nothing of a delay."""
+        return np.array([key == TIME_OFFSET for key in self.corrects] or [False] * len(self.sigma))
+
+    def _squares(self, value: Array) -> Array:
+        squares, alone = (value / self.sigma) ** 2, self._alone
+        return np.where(alone, squares, squares[~alone].sum())
 
 
 def corrections(solved: Iterable[tuple[Constant, Array]], mount: Any) -> dict[str, float]:
     """Return what the estimate of a sensor's constants adds to its settings, by their keys; a place is turned into the axes of its mount (gtsam.Pose3)."""
-    found = {key: float(by) for constant, value in solved for key, by in zip(constant.corrects, value, strict=False)}
+    found = {key: float(value[n]) for constant, value in solved for n, key in constant.settings}
     if PLACE[0] in found:
         off_m = mount.rotation().matrix() @ np.array([found[key] for key in PLACE])
         found |= zip(PLACE, off_m.tolist(), strict=True)

@@ -74,8 +74,12 @@ def linear_factor(residual: Residual, at: Attachment, decision: Decision) -> Gra
         terms.append(Term(at.velocity_key, at.v_world_mps, residual.velocity_jacobian()))
     if at.slow_key is not None and residual.slow_jacobian is not None:
         terms.append(Term(at.slow_key, np.array(at.slow_value), residual.slow_jacobian()))
-    constants = zip(at.constants, residual.constant_jacobians(), strict=False)
-    terms += [Term(key, np.array(value), jacobian) for (key, value), jacobian in constants]
+    for n, ((key, value), by_own) in enumerate(zip(at.constants, residual.constant_jacobians(), strict=False)):
+        jacobian = by_own
+        if own := at.own_of(n):
+            jacobian = np.zeros((len(by_own), len(value)))
+            jacobian[:, own] = by_own
+        terms.append(Term(key, np.array(value), jacobian))
     return linear_update(residual, terms, decision)
 
 

@@ -436,20 +436,36 @@ def test_tf_static_beats_guessing(topic: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.mounts["imu"][1], rotation_z(90.0), atol=1e-9)
 
 
+def velocities(make: Messages, axes: str, frame: str = "sensor") -> tuple[list[Item], Array]:
+    """Velocities of the antenna of `drive` along some axes, and in its axes of world (N, 3)."""
+    fixes = [(topic, at, m) for topic, at, m in drive(make, sigma_m=0.02) if topic == "/fix"]
+    places = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for _, _, m in fixes]).T)
+    stamps = np.array([m.header.stamp.sec * S + m.header.stamp.nanosec for _, _, m in fixes])
+    v, items = np.gradient(places, (stamps - stamps[0]) * 1e-9, axis=0), list[Item]()
+    for stamp, (east, north, up) in zip(stamps.tolist(), v, strict=True):
+        told = {"enu": (east, north, up), "ned": (north, east, -up), "body": (np.hypot(east, north), 0.0, up)}[axes]
+        items.append(("/vel", stamp + 1_000_000, make.twist(stamp, told, frame=frame)))
+    return items, v
+
+
+@pytest.mark.parametrize(("frame", "antenna"), [("gps", "gnss"), ("dvl", "")])
+def test_a_velocity_in_the_frame_of_the_fixes_is_of_their_antenna(frame: str, antenna: str, tmp_path: Path) -> None:
+    """Another one may be of an INS, that sits elsewhere."""
+    make = Messages(2)
+    items = [*drive(make), *velocities(make, "enu", frame)[0]]
+    _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    block = config.sensors["gnss_velocity"]
+    assert (block.antenna, block.mount_sigma_m) == (antenna, 1.0)
+
+
 @pytest.mark.parametrize(
     ("axes", "said", "enabled"),
     [("enu", "east, north, up", True), ("ned", "north, east, down", True), ("body", "forward, left, up", False)],
 )
 def test_axes_of_a_velocity(axes: str, said: str, enabled: bool, tmp_path: Path) -> None:
     """The axes of a velocity are found out by the track; one along the body is another kind of sensor, and off to begin with."""
-    make, items = Messages(2), []
-    fixes = [(topic, at, m) for topic, at, m in drive(make, sigma_m=0.02) if topic == "/fix"]
-    places = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for _, _, m in fixes]).T)
-    stamps = np.array([m.header.stamp.sec * S + m.header.stamp.nanosec for _, _, m in fixes])
-    v = np.gradient(places, (stamps - stamps[0]) * 1e-9, axis=0)
-    for stamp, (east, north, up) in zip(stamps.tolist(), v, strict=True):
-        told = {"enu": (east, north, up), "ned": (north, east, -up), "body": (np.hypot(east, north), 0.0, up)}[axes]
-        items.append(("/vel", stamp + 1_000_000, make.twist(stamp, told)))
+    make = Messages(2)
+    items, v = velocities(make, axes)
     found, config, _ = look(tmp_path, sorted([*drive(make), *items], key=lambda item: item[1]), make)
     assert (found.velocities[0].axes or "").startswith(said)
     assert config.sensors["body_velocity" if axes == "body" else "gnss_velocity"].enabled is enabled

@@ -115,5 +115,8 @@ def test_a_time_far_beyond_its_sigma_is_said(mode: str) -> None:
     offline = mode == "offline"
     found = app.simulated(run).solution if offline else replay(run.recording, run.config).solution
     said = [w for w in found.stats.warnings if "sigmas from where it is set: add -" in w]
-    assert len(said) == 1
-    assert "gnss: time_offset_s is " in said[0]
+    assert all("gnss: time_offset_s is " in w for w in said)
+    by_s = [float(w.split("add ")[1].split()[0]) for w in said]
+    # Online it is named again once it proves twice as far off.
+    assert len(said) == 1 or (not offline and len(said) == 2 and by_s[1] <= 2.0 * by_s[0])
+    assert offline or by_s[-1] == pytest.approx(-LATE_S, abs=0.03)

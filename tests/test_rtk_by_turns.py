@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from graphloc import app
-from graphloc.build import shared_constants
+from graphloc.build import rows_of, shared_constants
 from graphloc.config import GnssConfig, SensorConfig, SlowErrorConfig, VelocityConfig, VesselConfig
 from graphloc.eval.drill import script
 from graphloc.eval.ekf import run_honest
 from graphloc.eval.holdout import HoldOut, telling
 from graphloc.eval.report import Trust, verdict
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.factors import SENSORS
 from graphloc.frames import Array, Geodetic
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, Measurement
@@ -286,16 +287,20 @@ def test_it_has_one_antenna_and_one_clock(solve: Callable[[Recording, VesselConf
         assert "also of gnss_other" in said.action
 
 
+def shared_with(name: str, config: VesselConfig) -> int | None:
+    return shared_constants(name, config, rows_of(config, SENSORS))[1]
+
+
 def test_parts_that_are_set_otherwise_have_constants_of_their_own() -> None:
     _, two = receiver(comes_and_goes, lambda _t: (0.0, 0.0))
     config = elsewhere(two).config
-    assert shared_constants("gnss_other", config) == list(config.sensors).index("gnss")
-    assert shared_constants("gnss", config) is None
+    assert shared_with("gnss_other", config) == list(config.sensors).index("gnss")
+    assert shared_with("gnss", config) is None
     measured = config.sensors["gnss"].model_copy(update={"mount_sigma_m": 0.0})
-    assert shared_constants("gnss_other", config.with_sensors({"gnss": measured})) is None
+    assert shared_with("gnss_other", config.with_sensors({"gnss": measured})) is None
     stern = {f"{name}_stern": config.sensors[name] for name in ("gnss", "gnss_other")}
     unclear = config.with_sensors(stern)  # of the same topic, or of none: two antennas are not one
-    assert {shared_constants(name, unclear) for name in unclear.of_kind("gnss")} == {None}
+    assert {shared_with(name, unclear) for name in unclear.of_kind("gnss")} == {None}
 
 
 def test_online_resumes_with_its_one_antenna(tmp_path: Path) -> None:

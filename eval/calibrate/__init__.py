@@ -99,11 +99,15 @@ def _configured(name: Name, recording: Recording, config: VesselConfig) -> tuple
 
 
 def _of_one_antenna(sensor: str, recording: Recording, config: VesselConfig) -> list[str]:
-    """Return the sensors of other kinds, and of the same receiver, at the same position: their lever arm is estimated from all of them together."""
+    """Return the sensors of other kinds, and of the same receiver, at the same position: their lever arm is estimated from all of them together.
+
+    Without those whose `antenna` is the sensor's: they sit where that is set.
+    """
     own = config.sensors[sensor]
     place = mount_of(sensor, own, recording.mounts)[0]
     others = [n for kind in PROBE if kind != own.kind and "x" in PROBE[kind] for n in config.of_kind(kind)]
     others += config.by_turns(sensor)[1:]
+    others = [n for n in others if getattr(config.sensors[n], "antenna", "") != sensor]
     return [n for n in others if np.array_equal(mount_of(n, config.sensors[n], recording.mounts)[0], place)]
 
 

@@ -24,12 +24,13 @@ from graphloc.build._attach import (
     state_of,
 )
 from graphloc.build._chains import (
-    CONSTANT_TAILS,
     JUMP,
     SPACED_BY,
     at_level,
     bias_step,
     closing_variance,
+    never_revised,
+    revisable,
     silent_s,
     slow_begin,
     slow_end,
@@ -77,7 +78,6 @@ from graphloc.build._problem import (
 from graphloc.build._thinned import Thinned, thinned
 
 __all__ = [
-    "CONSTANT_TAILS",
     "JUMP",
     "SPACED_BY",
     "Carry",
@@ -109,7 +109,9 @@ __all__ = [
     "make_problem",
     "mount_of",
     "nav_state",
+    "never_revised",
     "noisier_imu",
+    "revisable",
     "rows_of",
     "shared_constants",
     "silent_s",

@@ -225,6 +225,7 @@ def attach(problem: Sited, stream: Attaching, i: int, values: Estimates) -> Atta
         slow_age_s=max(int(stream.measurements[i].stamp_ns) - int(problem.timeline.slow_stamps_ns[j]), 0) * 1e-9,
         slow_walk=_slow_walk(problem, stream, i),
         constants=constants_of(stream, values),
+        own=tuple(constant.own for constant in stream.constants),
         felt=_felt(problem, stream.felt[i], carried_to, bias) if asks_for_delay(stream.constants) else None,
     )
 

@@ -23,13 +23,15 @@ from numpy.typing import NDArray
 from graphloc import keys
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
-from graphloc.graph import InertialLink, SlowProcess
+from graphloc.graph import CONSTANT_TAILS, InertialLink, SlowProcess
 from graphloc.time import NS_PER_S, duration_ns
 
 # Loss of a step: beyond this many sigmas it counts as a jump.
 JUMP = KernelConfig(kind="cauchy", scale=2.0)
 _FAR = 2.0  # F above: sigmas beyond which such a component counts as far off
-CONSTANT_TAILS = 9.0  # squared sigmas at which the variance of a constant's prior doubles
+# Sigmas of the part of a constant's prior that is never weighed otherwise, and half of them the most that it is widened to: a vessel of
+# 100 m has its antenna 20 m from where 1 m was drafted.
+_WIDEST = 60.0
 _NOTHING = 1e6  # sigmas: no information
 _NO_DRIFT = 100.0  # times the time constant
 _SILENT = 3.0  # times the usual time between measurements
@@ -45,19 +47,46 @@ def bias_step(links: InertialLink, j: int, dt_s: float) -> Any:
     return gtsam.BetweenFactorConstantBias(keys.bias(j), keys.bias(j + 1), gtsam.imuBias.ConstantBias(), model)
 
 
-def slow_begin(slow: SlowProcess, key: int, known: Array, *, jumps: bool = True, far: bool = True) -> Iterator[Any]:
+def slow_begin(
+    slow: SlowProcess, key: int, known: Array | None, *, jumps: bool = True, far: bool = True
+) -> Iterator[Any]:
     """Yield the priors of the first node of a chain.
 
     Args:
-        known: (k,) its estimate, which sets the tails of constant components. jumps, far: as in `slow_step`.
+        known: (k,) its estimate, which sets the tails of constant components; None: only the part of their prior that is never weighed
+            otherwise (see `revisable`); `slow_end` has the other. jumps, far: as in `slow_step`.
     """
     constant = slow.constant
     if constant.any():
-        # Why tails: see `_add_constants` in `_graph.py`.
-        tails = np.sqrt(1.0 + (known / slow.sigma) ** 2 / CONSTANT_TAILS)
-        tails[[axis in slow.no_tails for axis in slow.axes]] = 1.0
+        tails = np.where(_with_no_tails(slow), 1.0, _WIDEST) if known is None else _tails(slow, known)
         yield _prior(key, slow.sigma * np.where(constant, tails, _NOTHING))
     yield from _standing(slow, key, np.full(len(constant), _CHAIN_END), jumps=jumps, far=far)
+
+
+def _with_no_tails(slow: SlowProcess) -> NDArray[np.bool_]:
+    return np.array([axis in slow.no_tails for axis in slow.axes])
+
+
+def _tails(slow: SlowProcess, value: Array) -> Array:
+    """Return by how much (k,) the priors of constants are widened at a value (k,); why: see `Constant.widened`."""
+    return np.where(_with_no_tails(slow), 1.0, np.sqrt(1.0 + (value / slow.sigma) ** 2 / CONSTANT_TAILS))
+
+
+def revisable(sigma: Array, widened: Array) -> Array:
+    """Return the sigmas (k,) of the part of a constant's prior that a window may yet weigh otherwise; with the other part it is `widened`.
+
+    Online a prior that has become part of what was marginalised, or of an anchor, keeps the weight that it had then: an antenna 20 m from its
+    mount (1 m, 1 sigma) was held back for good by what it was taken for in the first seconds, as if to 1 m.
+
+    Args:
+        sigma: (k,) of the prior. widened: (k,) the same re-weighted at the estimate.
+    """
+    return np.asarray((np.minimum(widened, 0.5 * _WIDEST * sigma) ** -2 - never_revised(sigma) ** -2) ** -0.5)
+
+
+def never_revised(sigma: Array) -> Array:
+    """Return the sigmas (k,) of the other part."""
+    return _WIDEST * sigma
 
 
 def slow_step(
@@ -108,9 +137,18 @@ def silent_s(slow: SlowProcess, apart_s: float) -> float:
     return max(slow.anew_after_s, _SILENT * apart_s)
 
 
-def slow_end(slow: SlowProcess, key: int, *, jumps: bool = True, far: bool = True) -> Iterator[Any]:
-    """Yield the prior that closes a chain at its last node; `jumps`, `far` as in `slow_step`."""
+def slow_end(
+    slow: SlowProcess, key: int, value: Array | None = None, *, jumps: bool = True, far: bool = True
+) -> Iterator[Any]:
+    """Yield the priors that close a chain at its last node.
+
+    Args:
+        value: (k,) that node, where the prior of constants is here (see `slow_begin`). jumps, far: as in `slow_step`.
+    """
     yield from _standing(slow, key, np.full(len(slow.sigma), _CHAIN_END), jumps=jumps, far=far)
+    if value is not None and (slow.constant & ~_with_no_tails(slow)).any():
+        variance = closing_variance(slow, value)
+        yield _prior(key, np.where(slow.constant & np.isfinite(variance), np.sqrt(variance), _NOTHING * slow.sigma))
 
 
 def at_level(
@@ -165,11 +203,15 @@ def walk_between_nodes(slow: SlowProcess, period_s: float, apart_s: float) -> Ar
 
 
 def closing_variance(slow: SlowProcess, value: Array) -> Array:
-    """Return the variance (k,) of the prior that closes a chain, re-weighted at `value` (k,), its last node; inf for constants."""
+    """Return the variance (k,) of the prior that closes a chain, re-weighted at `value` (k,), its last node.
+
+    Of constants that of the revisable part of their prior; inf where there is none.
+    """
     far = slow.far_axes
     square = float(((value[far] / slow.sigma[far]) ** 2).sum())
     tails = np.where(far, 1.0 + square / _FAR**2, 1.0)
-    return np.where(slow.constant, np.inf, _CHAIN_END * slow.sigma**2 * tails)
+    own = np.where(_with_no_tails(slow), np.inf, revisable(slow.sigma, slow.sigma * _tails(slow, value)) ** 2)
+    return np.where(slow.constant, own, _CHAIN_END * slow.sigma**2 * tails)
 
 
 def standing_cost(slow: SlowProcess, path: Array, dt_s: Array, anew: NDArray[np.bool_] | None = None) -> float:

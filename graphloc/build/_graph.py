@@ -13,7 +13,7 @@ import numpy as np
 
 from graphloc import keys
 from graphloc.build._attach import constants_of
-from graphloc.build._chains import CONSTANT_TAILS, at_level, bias_step, slow_begin, slow_end, slow_step
+from graphloc.build._chains import at_level, bias_step, slow_begin, slow_end, slow_step
 from graphloc.build._problem import Problem, Stream
 from graphloc.frames import Array, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, SlowProcess
@@ -202,8 +202,7 @@ def cost_of_constants(problem: Problem, values: gtsam.Values, known: Collection[
         for (key, value), constant in zip(constants_of(stream, values), stream.constants, strict=True):
             if key not in seen:
                 seen.add(key)
-                squares = float(((value / constant.sigma) ** 2).sum())
-                cost += 0.5 * CONSTANT_TAILS * float(np.log1p(squares / CONSTANT_TAILS))
+                cost += constant.cost(value)
     return cost
 
 
@@ -214,19 +213,14 @@ def _add_constants(
     values: gtsam.Values,
     prior: StartPrior | Past,
 ) -> None:
-    """Add the constants that a factor of this stretch has, each with its prior.
-
-    The prior has the tails of Student's t, re-weighted at every pass: with a Gaussian one, a tag that was surveyed 0.5 m wrong pulls
-    two good ones along (error at the berth 0.5 m; 0.05 m with tails).
-    """
+    """Add the constants that a factor of this stretch has, each with its prior, re-weighted at every pass."""
     used = set(graph.keyVector()) if stream.constants else set()
     for (key, known), constant in zip(constants_of(stream, values), stream.constants, strict=True):
         if key in used and not guess.exists(key):  # two sensors may share it
             guess.insert(key, known)
             if isinstance(prior, Past) and key in prior.known:
                 continue
-            tails = np.sqrt(1.0 + float(((known / constant.sigma) ** 2).sum()) / CONSTANT_TAILS)
-            model = gtsam.noiseModel.Diagonal.Sigmas(constant.sigma * tails)
+            model = gtsam.noiseModel.Diagonal.Sigmas(constant.widened(known))
             graph.add(gtsam.PriorFactorVector(key, np.zeros(len(constant.sigma)), model))
 
 

@@ -19,7 +19,7 @@ from graphloc.build._usable import silent_sensors, sorted_out, usable_imu
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
-from graphloc.graph import InertialLink, InertialRow, Sensor, SlowProcess
+from graphloc.graph import PLACE, Constant, InertialLink, InertialRow, Sensor, SlowProcess
 from graphloc.measurements import Measurement
 from graphloc.recording import Mounts, Recording
 from graphloc.signals.pauses import common_pauses, pauses_warning
@@ -44,17 +44,52 @@ def mount_of(name: str, config: SensorConfig, mounts: Mounts) -> tuple[Array, Ar
     return mounts.get(name) or (config.mount.t_body_sensor_m, config.mount.R_body_sensor)
 
 
-_OF_THE_RECEIVER = {"mount", "stamps", "time_offset_s", "clock_drift_ppm", "stamp_sigma_s", "mount_sigma_m"}
+_OF_AN_ANTENNA = {"mount", "mount_sigma_m"}
+_OF_THE_RECEIVER = _OF_AN_ANTENNA | {"stamps", "time_offset_s", "clock_drift_ppm", "stamp_sigma_s"}
 
 
-def shared_constants(name: str, config: VesselConfig) -> int | None:
-    """Return the number of the sensor that has the same constants as another one: of those that read one receiver by turns the first.
+def shared_constants(
+    name: str, config: VesselConfig, rows: Mapping[str, Sensor]
+) -> tuple[tuple[Constant, ...], int | None]:
+    """Return the constants of a sensor, and the number of the sensor that has them, too; None: no other has, or they are said of this one.
 
-    A receiver has one antenna and one clock. None: they are its own, or it is set otherwise than the first.
+    Those that read one receiver by turns have one antenna and one clock; a velocity of that antenna has a delay of its own beside: a receiver may
+    filter it, or send it later. All are one constant, as a linear factor of more than three states takes longer to make.
+
+    Args:
+        rows: of all enabled sensors.
     """
-    first = config.receiver_of(name)
-    block, other = (config.sensors[of].model_dump(include=_OF_THE_RECEIVER) for of in (name, first))
-    return list(config.sensors).index(first) if name != first and block == other else None
+    first, own = config.antenna_of(name), rows[name].constants(config.sensors[name])
+    sharing = [n for n in rows if n != first and config.antenna_of(n) == first and _alike(n, first, config)]
+    if name not in (first, *sharing) or not sharing:
+        return own, None
+    (whole,) = rows[first].constants(config.sensors[first])
+    sigma, corrects, held = [*whole.sigma], [*whole.corrects], {first: tuple(range(len(whole.sigma)))}
+    for other in sharing:
+        (constant,) = rows[other].constants(config.sensors[other])
+        here = list[int]()
+        for key, size in zip(constant.corrects, constant.sigma, strict=True):
+            if config.receiver_of(other) != first and key not in PLACE:
+                sigma.append(size)
+                corrects.append(key)
+                here.append(len(sigma) - 1)
+            else:
+                here.append(whole.corrects.index(key))
+        held[other] = tuple(here)
+    number = list(config.sensors).index(first) if name != first else None
+    of_another = 0 if number is None else len(whole.sigma)
+    shared = replace(whole, sigma=np.array(sigma), corrects=tuple(corrects), own=held[name], of_another=of_another)
+    return (shared,), number
+
+
+def _alike(name: str, first: str, config: VesselConfig) -> bool:
+    """Whether a sensor shares something unknown with another of its antenna: else it is set otherwise."""
+    keys = _OF_THE_RECEIVER if config.receiver_of(name) == first else _OF_AN_ANTENNA
+    block, other = (config.sensors[of].model_dump(include=keys) for of in (name, first))
+    unknown = config.sensors[first].mount_sigma_m > 0.0 or (
+        keys is _OF_THE_RECEIVER and config.sensors[first].stamp_sigma_s > 0.0
+    )
+    return bool(block == other and unknown)
 
 
 def rows_of(config: VesselConfig, rows: Sequence[Sensor]) -> dict[str, Sensor]:
@@ -179,7 +214,7 @@ def _streams(
         by_waterline = height_told_better(problem.config, rows, left_out)
         slow, left_out, jumps = _with_jumps(row, config, own, problem.datum, slow, left_out, alone=alone)
         state, carry = _states_and_carries(own, problem.timeline, problem.links)
-        constants, stamps_ns = row.constants(config), stamps_of(own)
+        (constants, shares), stamps_ns = shared_constants(name, problem.config, by_name), stamps_of(own)
         found.append(
             Stream(
                 number=number,
@@ -191,7 +226,7 @@ def _streams(
                 without_height=by_waterline,
                 position_jumps=jumps,
                 constants=constants,
-                shares=shared_constants(name, problem.config),
+                shares=shares,
                 mount=gtsam.Pose3(gtsam.Rot3(R), t - problem.t_body_imu_m),
                 measurements=tuple(own),
                 state=state,

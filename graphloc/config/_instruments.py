@@ -216,6 +216,9 @@ class VelocityConfig(SensorConfig):
     from the motion: 0.1 s by as much as the vessel turns in 0.1 s."""
     mount_sigma_m: NonNegative = 0.0
     """Unknown error of where its antenna is taken to sit, 1 sigma, each axis, m; as that of `gnss`."""
+    antenna: str = ""
+    """Name of the `gnss` sensor whose antenna this is: `mount` and `mount_sigma_m` are then those of that sensor, and what is not known of the
+    place is estimated once, of both. `inspect` drafts it where both have one frame, or one topic. Empty: an antenna of its own."""
     nmea: Velocities = ("VTG",)
     """NMEA sentences to read, from one talker (`GPVTG`) or any (`VTG`): VTG, RMC."""
 

@@ -79,6 +79,9 @@ def _read_alike(a: Any, b: Any) -> bool:
     return not pairs or any(one.endswith(other) or other.endswith(one) for one, other in pairs)
 
 
+_OF_AN_ANTENNA = ("mount", "mount_sigma_m")
+
+
 class VesselConfig(Block):
     """A whole `vessel.yaml`."""
 
@@ -135,6 +138,23 @@ class VesselConfig(Block):
         return self
 
     @model_validator(mode="after")
+    def _each_antenna_has_one_place(self) -> VesselConfig:
+        """What is of another sensor's antenna sits where that does."""
+        for name, sensor in self.sensors.items():
+            if not (of := getattr(sensor, "antenna", "")):
+                continue
+            first = self.sensors.get(of)
+            if first is None or first.kind != "gnss":
+                raise ValueError(f"sensors: {name}.antenna: there is no gnss sensor '{of}'")
+            for key in _OF_AN_ANTENNA:
+                if key in sensor.model_fields_set and getattr(sensor, key) != getattr(first, key):
+                    raise ValueError(
+                        f"sensors: {name}.{key} is not that of {of}, whose antenna it is: delete it, or `antenna`"
+                    )
+            self.sensors[name] = sensor.model_copy(update={key: getattr(first, key) for key in _OF_AN_ANTENNA})
+        return self
+
+    @model_validator(mode="after")
     def _references_are_not_fused(self) -> VesselConfig:
         """What the track follows cannot say how good it is."""
         for key in ("truth_topic", "check_speed_topic"):
@@ -182,6 +202,11 @@ class VesselConfig(Block):
         turns = self.by_turns(name)
         read = [self.sensors[of].fixes for of in turns] if len(turns) > 1 else []
         return name if len(set(read)) < len(read) else min(turns, key=list(self.sensors).index)
+
+    def antenna_of(self, name: str) -> str:
+        """Return the name that stands for all enabled sensors of one antenna: those of one receiver, and its velocities (`antenna`)."""
+        of = getattr(self.sensors[name], "antenna", "")
+        return self.receiver_of(of if of in self.sensors and self.sensors[of].enabled else name)
 
     def of_kind(self, kind: str) -> dict[str, Any]:
         """Return the enabled sensors of a kind, by name."""

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from graphloc import gauss, keys
-from graphloc.build import Level, Past, Problem, StartPrior, constant_keys
+from graphloc.build import Level, Past, Problem, StartPrior, closing_variance, constant_keys, revisable
 from graphloc.frames import Array
 
 _CORE = 15  # pose, velocity, bias
@@ -137,11 +137,23 @@ class Anchor:
         root = np.linalg.solve(R, np.eye(len(R)))
         vectors = {name: values.atVector(key) for name, key in [*slow.items(), *constants.items()]}
         bias = values.atConstantBias(keys.bias(j))
+        mean, cov = root @ (Q.T @ b) + np.concatenate([np.zeros(_CORE), *vectors.values()]), root @ root.T
+        slow_of = [s.slow for s in problem.streams if s.slow is not None]
+        variances = [
+            np.where(process.constant, closing_variance(process, value), np.inf)
+            for process, value in zip(slow_of, vectors.values(), strict=False)
+        ]
+        of = {s.name: s for s in problem.streams}
+        for (name, n), key in constants.items():
+            constant = of[name].constants[n]
+            own = revisable(constant.sigma, constant.widened(values.atVector(key))) ** 2
+            variances.append(own if constant.corrects else np.full(len(own), np.inf))
+        mean, cov = without_priors(mean, cov, np.concatenate([np.full(_CORE, np.inf), *variances]))
         return cls.of_joint(
             int(problem.timeline.stamps_ns[k]),
             (values.atPose3(keys.pose(k)), values.atVector(keys.velocity(k)), bias.vector()),
-            root @ (Q.T @ b) + np.concatenate([np.zeros(_CORE), *vectors.values()]),
-            root @ root.T,
+            mean,
+            cov,
             {name: len(vectors[name]) for name in slow},
             {number: len(vectors[number]) for number in constants},
         )
@@ -248,11 +260,13 @@ def _conditional(mean: Array, joint: Array) -> ConditionalGaussian:
     return ConditionalGaussian(value=value, gain=np.asarray(gain, dtype=np.float64), cov=cov)
 
 
-def without_prior(mean: Array, cov: Array, rows: Array, variance: Array) -> tuple[Array, Array]:
-    """Return mean (n,) and covariance (n, n) after removing a prior on some rows (k,), of mean 0 and variance (k,).
+def without_priors(mean: Array, cov: Array, variance: Array) -> tuple[Array, Array]:
+    """Return mean (n,) and covariance (n, n) after removing independent priors of mean 0 and variance (n,); inf: there is none.
 
-    Such a prior closes a slow chain at its end. Kept in an anchor, it would count again when the continued chain is closed.
+    Such a prior closes a slow chain at its end, or may be weighed otherwise later. Kept in an anchor, it would count again.
     """
+    rows = np.flatnonzero(np.isfinite(variance))
+    variance = variance[rows]
     gain = np.linalg.solve(np.diag(variance) - cov[np.ix_(rows, rows)], cov[rows]).T
     return mean + gain @ mean[rows], cov + gain @ cov[rows]
 

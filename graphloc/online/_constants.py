@@ -3,20 +3,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from graphloc.build import CONSTANT_TAILS, constant_keys
+from graphloc.build import constant_keys, never_revised, revisable
 from graphloc.errors import SolveError
 from graphloc.frames import Array
-from graphloc.graph import PLACE, Constant
+from graphloc.graph import CONSTANT_TAILS, PLACE, Constant
 from graphloc.online._anchor import Anchor, ConditionalGaussian
 from graphloc.online._live import LiveProblem, LiveStream
-from graphloc.online._window import Window
+from graphloc.online._window import Held, Window
 from graphloc.solve.warnings import FAR_OFF, far_off
+
+_CHANGED = 0.05  # change of the sigma of a prior from which it is replaced
 
 Number = tuple[str, int]
 """Name of a sensor, and number of one of its constants."""
@@ -35,6 +37,7 @@ class Constants:
     def __init__(self, problem: LiveProblem, window: Window, known: Mapping[Number, ConditionalGaussian]) -> None:
         self._problem, self._window = problem, window
         self._known: dict[int, ConditionalGaussian] = {}
+        self._priors: dict[int, tuple[Held, Array]] = {}  # the revisable part of each, and its sigmas (see `revisable`)
         for stream in problem.streams.values():
             for n, (key, constant) in enumerate(zip(constant_keys(stream), stream.constants, strict=True)):
                 if (found := known.get((stream.name, n))) is None:
@@ -45,11 +48,38 @@ class Constants:
 
     def begin(self, anchor: Anchor, state: Sequence[int]) -> None:
         """Stage those that are known only together with the anchor's state, by the keys of its pose, velocity and bias."""
-        for key, known in [*self._known.items()]:
-            if known.gain.any():
-                del self._known[key]
+        for constant, key in self._settings():
+            if (known := self._known.pop(key, None)) is not None:
                 self._window.guess(key, known.value, 0.0)
                 self._window.add([anchor.conditional_factor(known, state, key)])
+                self._hold(constant, key, known.value)
+
+    def _settings(self) -> Iterator[tuple[Constant, int]]:
+        """Yield the constants that correct a setting, with their keys."""
+        for stream in self._problem.streams.values():
+            if stream.shares is None:
+                pairs = zip(stream.constants, constant_keys(stream), strict=True)
+                yield from ((constant, key) for constant, key in pairs if constant.corrects)
+
+    def _hold(self, constant: Constant, key: int, value: Array) -> None:
+        """Stage the revisable part of a prior, as at an estimate (k,)."""
+        sigma = revisable(constant.sigma, constant.widened(value))
+        self._priors[key] = self._window.add([_about_zero(key, sigma)]), sigma
+
+    def revise(self) -> None:
+        """Weigh the priors of those that correct a setting as the estimate has them now."""
+        for constant, key in self._settings():
+            if key in self._priors:
+                (held, was), value = self._priors[key], self._window.values.atVector(key)
+                now = revisable(constant.sigma, constant.widened(value))
+                if np.abs(now / was - 1.0).max() > _CHANGED and self._window.remove(held):
+                    self._hold(constant, key, value)
+
+    def revisable_variance(self, key: int) -> Array:
+        """Return the variance (k,) of the revisable part of a prior, which an anchor is without; inf: there is none."""
+        if key in self._priors:
+            return self._priors[key][1] ** 2
+        return np.full(len(self._window.values.atVector(key)), np.inf)
 
     def _keys(self) -> Iterator[tuple[Number, int]]:
         for stream in self._problem.streams.values():
@@ -66,6 +96,13 @@ class Constants:
                 continue
             if not window.values.exists(key):
                 known = self._known.pop(key, None)
+                if known is None and constant.corrects:
+                    value = np.zeros(len(constant.sigma))
+                    window.guess(key, value, now_s)
+                    window.add([_about_zero(key, never_revised(constant.sigma))])
+                    self._hold(constant, key, value)
+                    window.touch(key, now_s)
+                    continue
                 if known is None:
                     value = np.zeros(len(constant.sigma))
                     tails = gtsam.noiseModel.mEstimator.Cauchy.Create(float(np.sqrt(CONSTANT_TAILS)))
@@ -76,13 +113,14 @@ class Constants:
                 window.add([gtsam.PriorFactorVector(key, value, model)])
             window.touch(key, now_s)
 
-    def marked(self) -> dict[int, ConditionalGaussian]:
-        """Return the remembered estimates, for `back_to`."""
-        return dict(self._known)
+    def marked(self) -> Callable[[], None]:
+        """Return a function that restores what is known here: what was taken into the graph since has then left it again."""
+        known, priors = dict(self._known), dict(self._priors)
 
-    def back_to(self, mark: Mapping[int, ConditionalGaussian]) -> None:
-        """Restore the remembered estimates: what was taken into the graph since `marked` has left it again."""
-        self._known = dict(mark)
+        def back() -> None:
+            self._known, self._priors = known, priors
+
+        return back
 
     def remember(self, now_s: float) -> None:
         """Remember the constants that the next commit would marginalise; those that correct a setting stay in the window instead.
@@ -109,19 +147,15 @@ class Constants:
                 yield constant, self._known[key].value
 
     def far_off(self, stream: LiveStream) -> Iterator[tuple[str, float, str]]:
-        """Yield each setting of a stream that is clearly far from where the window has it, by how much, and a line on that.
-
-        Of what it shares another sensor says it.
-        """
-        if stream.shares is not None:
-            return
+        """Yield each setting of a stream that is clearly far from where the window has it, by how much, and a line on that."""
         for constant, key in zip(stream.constants, constant_keys(stream), strict=True):
             if constant.corrects and self._window.is_committed(key):
                 value = self._window.values.atVector(key)
                 for setting, by, said in far_off(stream.name, constant, value, stream.mount):
                     sigma = np.sqrt(np.diag(self._window.covariance([key])))
                     # Of a place the largest: a mount may turn its axes.
-                    unsure = sigma[-3:].max() if setting in PLACE else sigma[constant.corrects.index(setting)]
+                    same = PLACE if setting in PLACE else (setting,)
+                    unsure = max(sigma[n] for n, key_of in constant.settings if key_of in same)
                     if abs(by) > FAR_OFF * unsure:
                         yield setting, by, said
 
@@ -132,3 +166,7 @@ class Constants:
     def remembered(self) -> dict[Number, ConditionalGaussian]:
         """Return the estimates of the constants that are not in the graph."""
         return {number: self._known[key] for number, key in self._keys() if key in self._known}
+
+
+def _about_zero(key: int, sigma: Array) -> Any:
+    return gtsam.PriorFactorVector(key, np.zeros(len(sigma)), gtsam.noiseModel.Diagonal.Sigmas(sigma))

@@ -147,13 +147,13 @@ class Entries:
 
     def marked(self, own: Collection[Entry]) -> Callable[[], None]:
         """Return a function that restores the window as it is now (nothing being staged), and these entries."""
-        window, constants = self._window.marked(), self._constants.marked()
+        window, constants_back = self._window.marked(), self._constants.marked()
         entries = [(e, e.verdict, e.held, e.written, e.judged) for e in own]
         places = [(held, tuple(held.slots)) for _, _, held, _, _ in entries if held is not None]
 
         def back() -> None:
             self._window.back_to(window, places)
-            self._constants.back_to(constants)
+            constants_back()
             for entry, verdict, held, written, judged in entries:
                 entry.verdict, entry.held, entry.written, entry.judged = verdict, held, written, judged
 

@@ -107,6 +107,7 @@ class Lag:
             self._page_s = now_s
             window.relinearise()
             self._entries.follow_solver()
+            self._constants.revise()
         self._constants.remember(now_s)
         before = window.values.atPose3(pose).translation()
         window.commit()

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Collection, MutableMapping
+from collections.abc import Collection, Mapping, MutableMapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median
@@ -339,7 +339,7 @@ def live_problem(
     company = company_of(config, setup.rows)
     streams = {
         name: _live_stream(
-            setup, name, number, by_name[name], t, company,
+            setup, name, number, by_name, t, company,
             receiver=receivers.setdefault(name, ReceiverDetectors()), known=name in slow_known, start_ns=start_ns,
         )
         for number, name in enumerate(config.sensors)
@@ -363,7 +363,7 @@ def _live_stream(
     setup: Setup,
     name: str,
     number: int,
-    row: Sensor,
+    rows: Mapping[str, Sensor],
     t_body_imu_m: Array,
     company: int,
     *,
@@ -376,7 +376,8 @@ def _live_stream(
     Args:
         company: how many sensors can separate each other's slow errors from motion. known: its slow error is, at the start.
     """
-    config = setup.config.sensors[name]
+    config, row = setup.config.sensors[name], rows[name]
+    constants, shares = shared_constants(name, setup.config, rows)
     slow, left_out = slow_or_left_out(row, config, company)
     if left_out is not None and (receiver.jump.jumps or known):
         slow = without_drift(left_out)
@@ -389,8 +390,8 @@ def _live_stream(
         slow=slow,
         left_out=left_out,
         without_height=height_told_better(setup.config, setup.rows, left_out),
-        constants=row.constants(config),
-        shares=shared_constants(name, setup.config),
+        constants=constants,
+        shares=shares,
         mount=gtsam.Pose3(gtsam.Rot3(R), t - t_body_imu_m),
         scatter=Scatter(jumps=slow is not None and slow.jumps),
         receiver=receiver,

@@ -80,7 +80,9 @@ class Setup:
             sensor = self.config.sensors[name]
             slow = row.slow(sensor)
             added_to = sensor.model_dump(mode="json", include=_ADDED_TO)
-            found[name] = {**added_to, "slow_axes": [] if slow is None else list(slow.axes)}
+            first = self.config.antenna_of(name)
+            together = [n for n in self.config.sensors if self.config.antenna_of(n) == first]
+            found[name] = {**added_to, "slow_axes": [] if slow is None else list(slow.axes), "antenna": together}
         return found
 
     def hint(self, m: Measurement, datum: Datum) -> Hint:

@@ -16,7 +16,7 @@ from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import TIME_OFFSET, Attachment, Going, InertialLink, Residual
 from graphloc.motion_model import UNSURE_MPS, Moving
-from graphloc.online._anchor import Anchor, in_world, without_prior
+from graphloc.online._anchor import Anchor, in_world, without_priors
 from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window
@@ -94,7 +94,8 @@ class States:
         guess: tuple[gtsam.Pose3, Array, Array],
     ) -> None:
         self._problem, self._window, self._constants = problem, window, constants
-        self._ends: dict[str, Held] = {}  # the prior that closes the slow chain of each sensor
+        # The priors that close the slow chain of each sensor, and the value (k,) that those of its constants are re-weighted at.
+        self._ends: dict[str, tuple[Held, Array]] = {}
         self._links: dict[int, Held] = {}  # IMU factors, by the state that each begins at
         state = (keys.pose(0), keys.velocity(0), keys.bias(0))
         pose, velocity, bias = guess
@@ -107,10 +108,11 @@ class States:
                 key, known = keys.slow(stream.number, 0), anchor.slow.get(stream.name)
                 if known is not None and len(known.value) != len(stream.slow.sigma):
                     raise SolveError(f"{stream.name}: its slow error is of another size")
-                window.guess(key, np.zeros(len(stream.slow.sigma)) if known is None else known.value, 0.0)
-                window.add(slow_begin(stream.slow, key, np.zeros(len(stream.slow.sigma)))
+                value = np.zeros(len(stream.slow.sigma)) if known is None else known.value
+                window.guess(key, value, 0.0)
+                window.add(slow_begin(stream.slow, key, None)
                            if known is None else [anchor.conditional_factor(known, state, key)])  # fmt: skip
-                self._ends[stream.name] = window.add(slow_end(stream.slow, key))
+                self._ends[stream.name] = window.add(slow_end(stream.slow, key, value)), value
         constants.begin(anchor, state)
         window.commit()
         self._newest = self._read()
@@ -203,11 +205,8 @@ class States:
             # Begun at the other level, it would be drawn back to the usual one by the prior that closes the chain, and the pose with it.
             window.guess(following, value + (0.0 if step is None else step), t)
             window.add(slow_step(stream.slow, key, following, dt_s, jump_m=jump_m, expected=step, anew=anew))
-            if stream.name in self._ends:
-                window.remove(self._ends[stream.name])
-            ends = list(slow_end(stream.slow, following))
-            if ends:
-                self._ends[stream.name] = window.add(ends)
+            if window.remove(self._ends[stream.name][0]):
+                self._ends[stream.name] = window.add(slow_end(stream.slow, following, value)), value
 
     def _jumped(self, stream: LiveStream, j: int, later: int) -> tuple[float, Array | None]:
         """Return the size (m) of the jumps from slow node j to a later one, and their slow error (k,), as `LiveStream.jumped`."""
@@ -323,7 +322,7 @@ class States:
         return sum(self._window.errors_of(held for k, held in self._links.items() if k >= first and held.slots))
 
     def anchor(self) -> Anchor:
-        """Return the anchor at the newest state, without the priors that close the slow chains: these continue from here."""
+        """Return the anchor at the newest state, without the priors that close the slow chains, which continue from here, and without what may be weighed otherwise."""
         timeline, window, streams = self._problem.timeline, self._window, self._problem.streams
         k = timeline.last
         j = timeline.slow_of[k]
@@ -334,13 +333,13 @@ class States:
         joint = window.covariance(every)
         vectors = [window.values.atVector(key) for key in every[3:]]
         mean = np.concatenate([np.zeros(15), *vectors])
-        ends = np.cumsum([15, *map(len, vectors)])
-        for name, value, first in zip(slow, vectors, ends, strict=False):
+        variances = []
+        for name, value in zip(slow, vectors, strict=False):
             process = streams[name].slow
             assert process is not None
-            variance = closing_variance(process, value)
-            closed = np.isfinite(variance)
-            mean, joint = without_prior(mean, joint, first + np.flatnonzero(closed), variance[closed])
+            variances.append(closing_variance(process, np.where(process.constant, self._ends[name][1], value)))
+        variances += map(self._constants.revisable_variance, constants.values())
+        mean, joint = without_priors(mean, joint, np.concatenate([np.full(15, np.inf), *variances]))
         bias = window.values.atConstantBias(core[2])
         anchor = Anchor.of_joint(
             timeline.stamps_ns[k],

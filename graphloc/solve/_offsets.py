@@ -52,7 +52,8 @@ def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
     columns: dict[tuple[str, Offset], Array] = {}
     numbered = {stream.number: stream for stream in problem.streams}
     for stream in problem.streams:
-        first = stream if stream.shares is None else numbered.get(stream.shares, stream)  # of one antenna and one clock
+        first = stream if stream.shares is None else numbered.get(stream.shares, stream)
+        first = first if first.config.kind == stream.config.kind else stream  # a velocity has a delay of its own
         wanted = tuple(probe.get(stream.config.kind, ()))
         own = _columns(problem, stream, rows, values, result, wanted) if wanted else np.zeros((0, 0))
         for c, what in enumerate(wanted):

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc import keys
-from graphloc.build import CONSTANT_TAILS, Problem, Stream, solved_constants
+from graphloc.build import Problem, Stream, solved_constants
 from graphloc.config import SIGMA_SCALES, PoseConfig, SensorConfig
 from graphloc.frames import Array
-from graphloc.graph import TIME_OFFSET, Constant, SlowProcess, corrections
+from graphloc.graph import CONSTANT_TAILS, TIME_OFFSET, Constant, SlowProcess, corrections
 from graphloc.signals.position_jumps import jump_warnings, largest_sigma
 from graphloc.signals.series import runs
 from graphloc.solution import CONTRADICTING_COST, Graded, SolveStats
@@ -189,11 +189,8 @@ def stats_of(problem: Problem, result: BatchResult) -> SolveStats:
     """Return costs, iterations and warnings of a solved run."""
     expected = expected_cost(problem, result.verdicts)
     warnings = [*problem.warnings, *_of_the_run(problem, result, expected)]
-    there = {stream.number for stream in problem.streams}
     for stream in problem.streams:
-        warnings += _of_a_sensor(stream, result)
-        if stream.shares not in there:  # else they are said of the sensor that has the same
-            warnings += _of_constants(stream, result)
+        warnings += [*_of_a_sensor(stream, result), *_of_constants(stream, result)]
     return SolveStats(
         passes=result.passes,
         iterations=result.iterations,
@@ -299,12 +296,15 @@ def noise_warnings(problem: Problem, result: BatchResult) -> list[str]:
 def far_off(name: str, constant: Constant, value: Array, mount: Any) -> Iterator[tuple[str, float, str]]:
     """Yield each setting of a sensor that is far from where an estimate (k,) of its constant has it: its key, by how much, and a line.
 
+    Of what another sensor has, too, that one says it.
+
     Args:
         mount: of the sensor (gtsam.Pose3).
     """
-    for (key, by), sigma in zip(corrections([(constant, value)], mount).items(), constant.sigma, strict=False):
-        if (off := abs(by) / sigma) > FAR_OFF:
-            yield key, by, _add_to(name, key, by, off)
+    found = corrections([(constant, value)], mount)
+    for n, key in constant.settings:
+        if n >= constant.of_another and (off := abs(found[key]) / constant.sigma[n]) > FAR_OFF:
+            yield key, found[key], _add_to(name, key, found[key], off)
 
 
 def late_far_off(name: str, slow: SlowProcess | None, late_s: float) -> list[str]:
