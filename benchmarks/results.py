@@ -37,6 +37,7 @@ import smoothing
 import soak
 import sweep
 import tag_detector
+import warming_imu
 import where
 import wrong_imu
 from _rows import ROOT, Row
@@ -75,6 +76,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "E.dark": dead_reckoning.figures,
     "E.ekf": slow_filter.figures,
     "E.imu": wrong_imu.figures,
+    "E.warm": warming_imu.figures,
     "F.3": batch.figures,
     "F.3p": where.figures,
     "F.4": fuzz.figures,

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -25,6 +26,13 @@ def scattering() -> ImuSeries:
     return ImuSeries(sensor="imu", seqs=np.arange(count), stamps_ns=stamps_ns, accel_mps2=accel, gyro_radps=gyro)
 
 
+def steady(stamp_ns: int) -> SimpleNamespace:
+    """A newest state whose biases stay where they are."""
+    bias = gtsam.imuBias.ConstantBias()
+    cov = {"pose_cov": np.eye(6) * 1e-4, "bias_cov": np.eye(6) * 1e-8}
+    return SimpleNamespace(stamp_ns=stamp_ns, pose=gtsam.Pose3(), bias=bias, **cov)
+
+
 def said(likely: Any, *at_s: float, lag_s: float = 10.0) -> list[str]:
     """What is said at some times of windows in which the larger noises are so likely, relative to what is configured."""
 
@@ -36,11 +44,12 @@ def said(likely: Any, *at_s: float, lag_s: float = 10.0) -> list[str]:
     noise = ImuNoise(adapt=True)
     noise.begin(SECOND)
     config = SimpleNamespace(sensors={"imu": SENSOR})
+    links = SimpleNamespace(bias_steps=lambda dt_s: np.full(6, 1e-5 * np.sqrt(dt_s)))
     lines = []
     for at in at_s:
         lag: Any = SimpleNamespace(
-            fresh=True, lag_s=lag_s, newest=SimpleNamespace(stamp_ns=SECOND + round(at * SECOND)), misfit=lambda: 1.0,
-            problem=SimpleNamespace(config=config), likelihoods=likelihoods,
+            fresh=True, lag_s=lag_s, newest=steady(SECOND + round(at * SECOND)), misfit=lambda: 1.0,
+            problem=SimpleNamespace(config=config, links=links), likelihoods=likelihoods,
         )  # fmt: skip
         lines.append(noise.raised(lag, scattering))
     return lines

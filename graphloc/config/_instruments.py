@@ -36,9 +36,9 @@ class ImuConfig(SensorConfig):
     gyro_noise_mdps_per_sqrt_hz: Positive = 20.0
     """Gyroscope white noise, mdeg/s/sqrt(Hz)."""
     accel_bias_instability_ug: Positive = 100.0
-    """In-run accelerometer bias instability, ug."""
+    """In-run accelerometer bias instability, ug. Raised, with a warning, where the biases go farther (see `adapt_noise`)."""
     gyro_bias_instability_deg_per_h: Positive = 20.0
-    """In-run gyroscope bias instability, deg/h."""
+    """In-run gyroscope bias instability, deg/h. As above: a cheap one that warms up drifts by hundreds."""
     bias_correlation_s: Positive = 300.0
     """Time over which a bias drifts by its instability, s."""
     accel_bias_sigma_mg: Positive = 10.0
@@ -49,7 +49,8 @@ class ImuConfig(SensorConfig):
     """Unknown attitude error of its mount, 1 sigma, each axis, deg. Offline its yaw is estimated with the run, and the bounds include
     what is left of it. 0: the IMU's axes are those of the vessel by definition, or were calibrated to a tenth of a degree."""
     adapt_noise: bool = True
-    """Raise the noise (never lower it, and with a warning) if the run contradicts it, or the IMU's own residuals do."""
+    """Raise the noise (never lower it, and with a warning) if the run contradicts it, or the IMU's own residuals do; and the walk of
+    the biases, if they go farther than they may."""
     max_gap_s: Positive = 0.5
     """A longer interval between samples is an IMU gap: bridged with noise large enough for any motion of a vessel, s."""
     max_bridge_s: Positive = 20.0

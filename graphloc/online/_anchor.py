@@ -10,7 +10,7 @@ instead of 0.54 m after five restarts, and 1.1 m off.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -84,6 +84,12 @@ class Anchor:
         bias = np.concatenate([prior.bias.accelerometer(), prior.bias.gyroscope()])
         velocity = np.asarray(prior.velocity)
         return cls(stamp_ns=stamp_ns, pose=prior.pose, velocity=velocity, bias=bias, cov=cov, level=prior.level)
+
+    def widened(self, times: float) -> Anchor:
+        """Return it with covariances so many times as large: it was estimated with too little noise."""
+        slow = {name: replace(known, cov=known.cov * times) for name, known in self.slow.items()}
+        constants = {of: replace(known, cov=known.cov * times) for of, known in self.constants.items()}
+        return replace(self, cov=self.cov * times, slow=slow, constants=constants)
 
     @classmethod
     def of_joint(

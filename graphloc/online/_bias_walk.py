@@ -103,7 +103,7 @@ def _needed(gone: Array) -> float:
     """Return how many times the walk explains it, at most `_MOST_STEP`; `gone` as of `_squares`."""
 
     def beyond(times: float) -> float:
-        return _squares(gone, times) - gone.shape[1]
+        return _squares(gone, times) - float(gone.shape[1])
 
     if beyond(1.0) < 0.0:
         return 1.0

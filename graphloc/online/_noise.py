@@ -27,11 +27,12 @@ class ImuNoise:
 
     Attributes:
         scale: of both, at least 1. gyro, accel: beside it, of each. walk: those on the walk of the biases.
+        misled: how many times larger the covariance of an estimate is to be that had less of this walk; 1: `raised` raised none.
     """
 
     def __init__(self, *, adapt: bool) -> None:
         self.scale, self.gyro, self.accel = 1.0, 1.0, 1.0
-        self.walk = BiasWalk()
+        self.walk, self.misled = BiasWalk(), 1.0
         self._adapt = adapt
         self._looked_ns, self._misfits, self._weighed_ns = 0, 0, 0
         self._gained = np.zeros(3)  # log-likelihood by a larger noise of both, of the gyroscope, of the accelerometer
@@ -61,8 +62,10 @@ class ImuNoise:
         # Until relinearised, the cost of a step includes how far its states have moved since.
         if not self._adapt or not lag.fresh:
             return ""
+        self.misled, before = 1.0, self.walk.times.copy()
         said = self.walk.raised(lag, samples) or self._contradicted(lag) or self._too_quiet(lag, samples)
         if said:
+            self.misled = float((self.walk.times / before).max())
             self.walk.begin()
         return said
 

@@ -305,7 +305,7 @@ class OnlineSmoother:
             if noise := persistent.sensor_noise.changed(tracking.lag) or persistent.noise.raised(
                 tracking.lag, tracking.samples
             ):
-                self._rebuild(noise)
+                self._rebuild(noise, persistent.noise.misled)
                 return self._estimate()
             return tracking.estimate()
         except Exception as error:  # noqa: BLE001 - whatever went wrong in there, the vessel still needs a pose
@@ -321,13 +321,13 @@ class OnlineSmoother:
             assert self._intake.newest is not None
             self._say(self._snapshot.write(tracking.snapshot(self._intake.newest)))
 
-    def _rebuild(self, why: str) -> None:
-        """Rebuild the window from an earlier state; where that fails, restart."""
+    def _rebuild(self, why: str, misled: float = 1.0) -> None:
+        """Rebuild the window from an earlier state; where that fails, restart. `misled`: as of `Tracking.rebuild`."""
         log.warning("online: %s", why)
         assert self._tracking is not None
         assert self._intake.newest is not None
         try:
-            self._say(self._tracking.rebuild(why, self._intake.newest.stamp_ns))
+            self._say(self._tracking.rebuild(why, self._intake.newest.stamp_ns, misled))
         except SolveError as error:
             self._restart(str(error))
 

@@ -379,11 +379,12 @@ class Tracking:
 
     # Rebuild, end
 
-    def rebuild(self, why: str, until_ns: int) -> str:
+    def rebuild(self, why: str, until_ns: int, misled: float = 1.0) -> str:
         """Build the window anew: with all that is in it, or, if that fails too, from the last anchor without what came since.
 
         Args:
             why: what failed. until_ns: stamp of the newest IMU sample.
+            misled: how many times larger the covariance of earlier states is than they were estimated with.
 
         Returns:
             What has happened, in one line.
@@ -393,6 +394,8 @@ class Tracking:
         """
         failed, recent, ledger = self.lag, self._recent, self._ledger
         ledger.enter(failed.gone())
+        if misled > 1.0:
+            recent.anchors = deque(anchor.widened(misled) for anchor in recent.anchors)
         anchors = self._anchors()
         for anchor, without in [(anchors[0], False), (anchors[-1], True)] if anchors else []:
             again = self._again_from(anchor)
