@@ -30,6 +30,7 @@ from graphloc.solution import Cause, Health, Solution
 from graphloc.solve import _start, alignment
 from graphloc.solve._start import solve_start
 from graphloc.solve.alignment import align, wanted_travel_m
+from graphloc.timeline import Timeline
 from graphloc.trajectory import bounds_95
 from tests.slowly import with_few_states
 
@@ -560,3 +561,31 @@ def test_a_long_first_window_is_not_dead_reckoned_at_once() -> None:
     found = np.array([begun.values.atPose3(keys.pose(k)).translation() for k in range(begun.last + 1)])
     off_m = np.hypot(*(found - truth.at(stamps_ns).p_world_m)[:, :2].T)
     assert off_m.max() < 4.0
+
+
+def test_a_candidate_of_a_long_start_is_not_solved_anew_from_its_start_at_each_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A craft that held its place for ten minutes took six minutes of CPU before its start was done: the work was quadratic in that time."""
+    n, solved = 600, list[int]()
+    problem: Any = SimpleNamespace(
+        timeline=Timeline(np.arange(n, dtype=np.int64) * 10**9, np.arange(n), np.arange(n, dtype=np.int64) * 10**9)
+    )
+    grown = list[tuple[int, int]]()
+
+    def solve(_problem: object, _candidate: object, last: int) -> int:
+        solved.append(last)
+        return 0
+
+    def grow(_problem: object, _values: object, _prior: object, known: int, *_: object, last: int) -> int:
+        grown.append((known, last))
+        return 0
+
+    monkeypatch.setattr(_start, "dead_reckon", lambda *_: None)
+    monkeypatch.setattr(_start, "_solve_candidate", solve)
+    monkeypatch.setattr(_start, "grow", grow)
+    candidate: Any = SimpleNamespace(values=None, prior=None)
+    _start._extend(problem, candidate, 0, n - 1)  # noqa: SLF001
+    assert solved[-1] == n - 1
+    assert sum(solved) < 1.5 * n
+    assert grown == [(solved[-2], n - 1)]

@@ -922,14 +922,14 @@ def test_a_damaged_snapshot_is_reported_and_not_used(tmp_path: Path, saved: str,
 def test_raised_noise_is_resumed_while_adapt_noise_is_on(tmp_path: Path, saved: str, *, adapt: bool) -> None:
     """What a snapshot says of the IMU's noise ends where `adapt_noise` has been switched off since."""
     path, base = tmp_path / "snapshot.json", arrivals_of(run_of())
-    path.write_text(json.dumps(json.loads(saved) | {"noise": [2.0, 3.0, 4.0]}), encoding="utf-8")
+    path.write_text(json.dumps(json.loads(saved) | {"noise": [2.0, 3.0, 4.0, 5.0, 6.0]}), encoding="utf-8")
     run = run_of()
     imu = run.config.sensors["imu"].model_copy(update={"adapt_noise": adapt})
     config = run.config.with_sensors({"imu": imu})
     online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL, snapshot=path)
     fed = feed(online, run, base[at_s(base, 8.5) : at_s(base, 11.0)])
     assert [e for e in fed.events if e.startswith("resumed from a snapshot")]
-    assert json.loads(path.read_text(encoding="utf-8"))["noise"] == ([2.0, 3.0, 4.0] if adapt else [1.0, 1.0, 1.0])
+    assert json.loads(path.read_text(encoding="utf-8"))["noise"] == ([2.0, 3.0, 4.0, 5.0, 6.0] if adapt else [1.0] * 5)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,6 @@ from graphloc.solve._offsets import offsets_of
 from graphloc.solve._parts import solve_parts
 from graphloc.solve._solution import make_solution
 from graphloc.solve.batch import BatchResult, solve_batch
-from graphloc.solve.bias_walk import walk_times
 from graphloc.solve.wrong_imu import ImuWrong, left_out
 
 __all__ = ["smooth"]
@@ -54,28 +53,18 @@ def smooth(
         SolveError: the run cannot be started or solved; the text says why.
     """
 
-    def solved(part: Recording, begun: VesselConfig) -> tuple[BatchResult, Recording, list[str]]:
-        """Return the result, the recording without the spans in which the IMU is wrong, and a line on each search that found some."""
+    def solve(part: Recording, heading_deg: float | None) -> Solution:
+        begun = config if heading_deg is None else config.with_start_heading(heading_deg)
         said = list[str]()
         for tried in range(_MOST_TIMES + 1):
             problem = make_problem(part, begun, datum, rows, inertial)
             try:
-                return solve_batch(problem, progress, doubt_imu=tried < _MOST_TIMES), part, said
+                result = solve_batch(problem, progress, doubt_imu=tried < _MOST_TIMES)
+                break
             except ImuWrong as wrong:
                 part, why = left_out(part, wrong.spans)
                 said.append(why)
-        raise AssertionError("the last search doubts nothing")
-
-    def solve(part: Recording, heading_deg: float | None) -> Solution:
-        begun = config if heading_deg is None else config.with_start_heading(heading_deg)
-        result, kept, said = solved(part, begun)
-        imu = result.problem.imu.sensor
-        if said and (times := walk_times(begun.sensors[imu], result.problem.config.sensors[imu])):
-            # It may have been no more than biases that wander.
-            result, kept, said = solved(part, begun.scaled({imu: times}))
-            as_stated = result.stated.config.scaled({imu: {key: 1.0 / by for key, by in times.items()}})
-            result = replace(result, stated=replace(result.stated, config=as_stated))
-        solution = make_solution(result.stated, kept, result)
+        solution = make_solution(result.stated, part, result)
         solution = replace(solution, stats=replace(solution.stats, warnings=(*said, *solution.stats.warnings)))
         if probe is None:
             return solution

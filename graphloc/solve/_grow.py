@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 
 import gtsam
 import numpy as np
@@ -12,6 +12,7 @@ from graphloc.build import Past, Problem, StartPrior, without_imu
 from graphloc.recording import Progress
 from graphloc.solve._marginals import marginals
 from graphloc.solve._passes import cost_as_configured
+from graphloc.solve.bias_walk import KEYS, BiasWanders, known_bias, went_too_far
 from graphloc.solve.decide import PredictedCovariance, Stage, Verdicts, agrees, decisions, predicted_by, weigh
 from graphloc.solve.stretch import (
     StretchStep,
@@ -53,13 +54,14 @@ def grow(
 
     Raises:
         ImuWrong: there are some.
+        BiasWanders: the IMU is not wrong, but its biases wander farther than configured.
     """
     stamps, slow_of = problem.timeline.stamps_ns, problem.timeline.slow_of
     end = len(problem.timeline) - 1 if last is None else last
     prior: StartPrior | Past = start
     verdicts = weigh(problem, estimate, first=0, last=known, stage=Stage.FINAL)
     step = solve_stretch(problem, estimate, 0, known, prior, decisions(verdicts))
-    iterations, first = step.iterations, 0
+    iterations, first, pasts = step.iterations, 0, list[tuple[int, Past]]()
     window = GrownWindow(problem, estimate, 0, 0, known, prior)
     if doubt_imu and doubt_start and (found := _without_imu(window, gtsam.Values())) is not None:
         problem, step, verdicts, more = found
@@ -71,11 +73,14 @@ def grow(
         if start_of_window > first and slow_of[start_of_window] < slow_of[known]:
             prior = past_at(problem, step, start_of_window)
             first = start_of_window
+            pasts.append((first, prior))
         before = copy_states(problem, estimate, first, known)
         dead_reckon(problem, estimate, known, until)
         window = GrownWindow(problem, estimate, first, known, until, prior)
         used, step, verdicts = _solve_grown(window)
         if doubt_imu and (found := _without_imu(window, before)) is not None:
+            if (wanders := _wanders(problem, estimate, pasts)) is not None:
+                raise wanders
             problem, step, verdicts, more = found
             used += more
         watch(until, verdicts)
@@ -98,6 +103,15 @@ def _without_imu(window: GrownWindow, before: gtsam.Values) -> tuple[Problem, St
     rest = without_imu(window.problem, window.values, *span)
     iterations, step, verdicts = _solve_grown(window._replace(problem=rest))
     return rest, step, verdicts, iterations
+
+
+def _wanders(problem: Problem, values: gtsam.Values, before: Sequence[tuple[int, Past]]) -> BiasWanders | None:
+    """Return how far the biases wander in what was known at some states, each by the data before it; None: they do not, or are not to be adapted."""
+    if not problem.config.sensors[problem.imu.sensor].adapt_noise:
+        return None
+    known = [known_bias(problem, values, k, past) for k, past in before]
+    found = [w for n, now in enumerate(known) if (w := went_too_far(known[:n], now, problem.links)) is not None]
+    return BiasWanders({KEYS[k]: times for k, times in found[-1:]}) if found else None
 
 
 def _solve_grown(window: GrownWindow) -> tuple[int, StretchStep, Verdicts]:

@@ -21,7 +21,8 @@ from graphloc import keys
 from graphloc.build import Problem, StartPrior
 from graphloc.errors import SolveError
 from graphloc.frames import Array, wrap_angle
-from graphloc.recording import Progress
+from graphloc.recording import Progress, quiet
+from graphloc.solve._grow import grow
 from graphloc.solve._passes import expected_cost
 from graphloc.solve.alignment import Start, start_pose
 from graphloc.solve.decide import Stage, cost_of_noise, decisions, weigh
@@ -30,6 +31,9 @@ from graphloc.solve.stretch import copy_states, dead_reckon, fill_slow, solve_st
 # Starts that cost this much more (log-likelihood) are dropped; while several remain, the window grows.
 _COST_APART, _LONGEST_S, _LONGEST_UNTOLD_S = 8.0, 60.0, 600.0
 _STEP_NS = 15_000_000_000  # most that a candidate is dead-reckoned before it is solved again
+_WHOLE_NS = (
+    60_000_000_000  # from its start; later steps take what is before them as known, and all of it is solved at the end
+)
 _PLACE_S, _LATE_PLACE_S = 5.0, 90.0  # of positions in the first window; latest time of the first one
 # Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
 _STAGES = ((Stage.FAR, 8, 0.5, False), (Stage.OPEN, 2, 0.5, False), (Stage.FINAL, 2, 0.5, True))
@@ -232,10 +236,15 @@ def _held(problem: Problem, start: Start, best: _Candidate, last: int, at: int, 
 def _extend(problem: Problem, candidate: _Candidate, known: int, until: int) -> int:
     """Take a candidate from state `known` to `until`, in place, a step at a time; return the iterations.
 
-    Dead-reckoned at once over a minute, with biases not known yet, it would be kilometres off, where nothing leads back.
+    Dead-reckoned at once over a minute, with biases not known yet, it would be kilometres off, where nothing leads back. And solved from
+    its start at each step, a vessel that lies still for ten minutes would take minutes for each candidate.
     """
     stamps, iterations = problem.timeline.stamps_ns, 0
+    whole = problem.timeline.floor(int(stamps[0]) + _WHOLE_NS)
     while known < until:
+        if known >= whole:
+            iterations += grow(problem, candidate.values, candidate.prior, known, quiet, last=until)
+            return iterations + _solve_candidate(problem, candidate, until)
         start, known = known, min(max(problem.timeline.floor(int(stamps[known]) + _STEP_NS), known + 1), until)
         dead_reckon(problem, candidate.values, start, known)
         iterations += _solve_candidate(problem, candidate, known)

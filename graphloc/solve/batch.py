@@ -27,7 +27,7 @@ from functools import partial
 import gtsam
 import numpy as np
 
-from graphloc.build import Problem, StartPrior, bridged, thinned, with_noise_scale, with_sensor_noise
+from graphloc.build import Problem, StartPrior, bridged, thinned, with_imu_scaled, with_noise_scale, with_sensor_noise
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.recording import Progress, quiet
@@ -39,13 +39,13 @@ from graphloc.solve._marginals import marginals
 from graphloc.solve._passes import cost_of_run, cost_without_outliers, rough_passes
 from graphloc.solve._returns import doubtful_returns
 from graphloc.solve._start import Begun
-from graphloc.solve.bias_walk import with_needed_walk
+from graphloc.solve.bias_walk import BiasWanders, with_needed_walk
 from graphloc.solve.decide import Stage, Verdicts
 from graphloc.solve.imu_mount import MountError, with_mount_estimated
 from graphloc.solve.imu_noise import CONTRADICTION, noise_step, with_needed_noise
 from graphloc.solve.sensor_noise import scattering
 
-_MAX_NOISE_ROUNDS, _MAX_JUMP_ROUNDS, _MAX_WALK_ROUNDS = 4, 2, 2
+_MAX_NOISE_ROUNDS, _MAX_JUMP_ROUNDS, _MAX_WALK_ROUNDS = 4, 2, 3
 # Nats by which each jump must make a run more probable: which of a thousand fixes it is at and what it leads to, of a hundred places
 # along each axis, are worth 16; in 25 of 27 runs with jumps each did by over 30, between high houses, where fixes wander, by 15 to 20.
 _OF_A_JUMP = 25.0
@@ -138,8 +138,15 @@ class _Underway:
         self._solve_first(problem)
 
     def _solve_first(self, problem: Problem) -> None:
-        """Solve a problem from its start."""
-        self._hold(*self._solve(problem))
+        """Solve a problem from its start; with biases that wander farther, where these make the IMU seem wrong."""
+        for _ in range(_MAX_WALK_ROUNDS):
+            try:
+                self._hold(*self._solve(problem))
+                break
+            except BiasWanders as wanders:
+                problem = with_imu_scaled(problem, wanders.times)
+        else:
+            self._hold(*self._solve(problem, doubt_imu=False))
         self._problem = problem
 
     def _hold(self, begun: Begun, solved: SolvedRun, mount: MountError | None = None) -> None:

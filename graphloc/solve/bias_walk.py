@@ -7,15 +7,18 @@ are too small, and it seems to contradict the other sensors.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import chdtrc
 
 from graphloc import keys
-from graphloc.build import Problem, StartPrior, with_imu_scaled
+from graphloc.build import Past, Problem, StartPrior, with_imu_scaled
 from graphloc.frames import Array
+from graphloc.graph import InertialLink
 from graphloc.solve.decide import Verdicts
 from graphloc.solve.imu_noise import components, squares_and_freedom
 from graphloc.solve.linearised import linearised, normal_solver
@@ -26,23 +29,102 @@ WANDERS_S = 60.0
 KEYS = ("accel_bias_instability_ug", "gyro_bias_instability_deg_per_h")
 """What is configured of accelerometers and gyroscopes."""
 _WANDERS = 3.0  # sigmas of its random walk over that: smoothed, a bias that walks so moves by less than two
+_TOO_FAR = 1e-5
+_MOST_STEP, _LEAST_STEP = 10.0, 1.3  # what is known is too sure as well, so more is not believed at once
+_LEAST_SHARE = 0.1  # of the walk, that a bias may go though nothing measures it: rounding
 _UNLIKELY, _LEAST_TIMES = 1e-4, 2.0
 MOST_TIMES = 100.0
 """No bias walks so many times faster than configured."""
 
 
+class BiasWanders(Exception):
+    """The biases walk so many times farther than configured; `times`: by key of the IMU's configuration."""
+
+    def __init__(self, times: dict[str, float]) -> None:
+        super().__init__(times)
+        self.times = times
+
+
+class KnownBias(NamedTuple):
+    """Biases (6,), accelerometers first, and their variances (6,), at a stamp."""
+
+    stamp_ns: int
+    bias: Array
+    variance: Array
+
+
+def known_bias(problem: Problem, values: gtsam.Values, k: int, past: Past) -> KnownBias:
+    """Return the biases at state `k` by all data before it; `values`: near those that these data were linearised at."""
+    own, order = keys.bias(int(problem.timeline.slow_of[k])), gtsam.Ordering()
+    for key in (*(key for key in past.known if key != own), own):
+        order.push_back(key)
+    A, b = past.factors.linearize(values).jacobian(order)
+    Q, R = np.linalg.qr(A)
+    root = np.linalg.solve(R[-6:, -6:], np.eye(6))
+    bias = values.atConstantBias(own).vector() + root @ (Q.T @ b)[-6:]
+    return KnownBias(int(problem.timeline.stamps_ns[k]), bias, np.diagonal(root @ root.T))
+
+
 def wandered(problem: Problem, values: gtsam.Values) -> Array:
     """Return how far accelerometers and gyroscopes have gone (2,), the worst axis of each, in sigmas of their random walk, within a minute; 0 in a shorter run."""
-    nodes, first = np.unique(problem.timeline.slow_of, return_index=True)
-    t_s = (problem.timeline.stamps_ns[first] - problem.timeline.stamps_ns[0]) / NS_PER_S
+    t_s = (problem.timeline.slow_stamps_ns - problem.timeline.slow_stamps_ns[0]) / NS_PER_S
     later = np.searchsorted(t_s, t_s + WANDERS_S)
     begin = np.flatnonzero(later < len(t_s))
     if not len(begin):
         return np.zeros(2)
-    of = [values.atConstantBias(keys.bias(int(j))) for j in nodes]
-    bias = np.array([np.concatenate([b.accelerometer(), b.gyroscope()]) for b in of])
+    bias = np.array([values.atConstantBias(keys.bias(j)).vector() for j in range(len(t_s))])
     gone = np.abs(bias[later[begin]] - bias[begin]).max(axis=0) / problem.links.bias_steps(WANDERS_S)
     return np.asarray(gone.reshape(2, 3).max(axis=1))
+
+
+def went_too_far(before: Sequence[KnownBias], now: KnownBias, links: InertialLink) -> tuple[int, float] | None:
+    """Return which biases went farther than they may have (0: of accelerometers, 1: of gyroscopes), and how many times the walk explains it; None: none did.
+
+    An estimate that is as good as it says goes, from b with covariance P to b' with P', by N(0, P + Q - P'), Q: the walk in between.
+
+    Args:
+        before: of the same estimate, with less data.
+    """
+    gone = []
+    for then in before:
+        walk = links.bias_steps((now.stamp_ns - then.stamp_ns) * 1e-9) ** 2
+        each = np.array([(now.bias - then.bias) ** 2, then.variance - now.variance, walk])
+        gone += [(k, each[:, part]) for k, part in enumerate((slice(3), slice(3, 6)))]
+    if not gone:
+        return None
+    # Those that wander bend the others: the least likely are they.
+    k, least = min(gone, key=lambda found: _likely(found[1]))
+    times = _needed(least)
+    return (k, times) if _likely(least) < _TOO_FAR and times > _LEAST_STEP else None
+
+
+def _squares(gone: Array, times: float) -> float:
+    """Return the sum of the squares by which three biases went, by their variance with so many times the walk.
+
+    Args:
+        gone: (3, 3), of each axis the square, P - P' and Q as in `BiasWalk`.
+    """
+    squares, known, walk = gone
+    return float((squares / np.maximum(known + times**2 * walk, _LEAST_SHARE * walk)).sum())
+
+
+def _likely(gone: Array) -> float:
+    """Return how likely it is that they went as far as they did, or farther; `gone` as of `_squares`."""
+    return float(chdtrc(gone.shape[1], _squares(gone, 1.0)))
+
+
+def _needed(gone: Array) -> float:
+    """Return how many times the walk explains it, at most `_MOST_STEP`; `gone` as of `_squares`."""
+
+    def beyond(times: float) -> float:
+        return _squares(gone, times) - float(gone.shape[1])
+
+    if beyond(1.0) < 0.0:
+        return 1.0
+    if beyond(_MOST_STEP) > 0.0:
+        return _MOST_STEP
+    found: float = brentq(beyond, 1.0, _MOST_STEP)
+    return found
 
 
 def with_needed_walk(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Problem | None:
