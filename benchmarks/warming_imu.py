@@ -22,9 +22,9 @@ from graphloc.solution import Solution
 from graphloc.trajectory import bounds_95
 
 _LENGTH_S, _SETTLES_S = 200.0, 120.0
-_SEEDS = range(60, 64)
+_SEEDS = range(60, 63)
 # How far gyroscopes (deg/s) and accelerometers (m/s^2) settle, together on three axes.
-WARMING = ((0.0, 0.0), (0.05, 0.02), (0.15, 0.05), (0.5, 0.1), (2.0, 0.2))
+WARMING = ((0.0, 0.0), (0.15, 0.05), (0.5, 0.1), (2.0, 0.2))
 _GYRO_AXES, _ACCEL_AXES = np.array([0.4, -0.5, 0.77]), np.array([0.55, -0.37, 0.75])
 
 

@@ -205,6 +205,22 @@ def test_offline_the_start_is_in_doubt_only_where_it_contradicts_itself(
     assert seen == [excess > 2.5 and not told]
 
 
+def test_offline_a_gyroscope_that_warms_up_is_not_left_out_but_its_bias_walks_faster() -> None:
+    """From 3 deg/s, by half in 20 s: samples of most of the run were left out, and it took four times as long."""
+    run = slowly(run_of(length_s=75.0), 1.25)
+    imu = run.recording.imu
+    assert imu is not None
+    t_s = (imu.stamps_ns - imu.stamps_ns[0]) / S
+    off = np.radians(3.0) * 2.0 ** (-t_s / 20.0)
+    warm = replace(imu, gyro_radps=imu.gyro_radps + off[:, None] * [0.4, -0.5, 0.75])
+    solution = app.smooth_recording(replace(run.recording, imu=warm), run.config).solution
+    assert not [r for r in solution.ledger if r.sensor == "imu" and r.outcome is Outcome.REJECTED]
+    assert any("is taken" in w and "gyro_bias_instability" in w for w in solution.stats.warnings)
+    found = errors(solution.trajectory, run.truth)
+    assert np.linalg.norm(found.position_m[:, :2], axis=1).max() < 1.0
+    assert np.abs(found.heading_rad).max() < np.radians(3.0)
+
+
 @pytest.mark.parametrize("change", [compass_turns, both_off])
 def test_offline_it_is_not_blamed_for_others(change: Change) -> None:
     solution, *_ = smoothed(change, until_s=22.0)
