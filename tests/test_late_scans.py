@@ -117,7 +117,7 @@ def test_late_scans_are_found_out(mode: Any, less: float) -> None:
     believed, estimated = measured(mode(0.0, 0.15)), measured(mode(0.05, 0.15))
     assert believed.coverage_95 is not None
     assert estimated.coverage_95 is not None
-    assert believed.coverage_95 < 0.6
+    assert believed.coverage_95 < 0.8  # not less: what the delay does looks like biases that wander, so the bounds grow
     assert estimated.coverage_95 > 0.9
     assert estimated.position_rmse_m < less * believed.position_rmse_m
 
@@ -157,8 +157,10 @@ def test_the_report_says_what_the_track_lacks_of_a_delay(taken_s: float | None, 
 @pytest.mark.parametrize("mode", [offline, replayed], ids=["offline", "online"])
 def test_a_clock_far_beyond_its_sigma_is_said_and_no_pose_is_good(mode: Any) -> None:
     found = mode(0.02, 0.15)
-    (said,) = (w for w in found.stats.warnings if "sigmas from where it is set: add -0." in w)
+    # Online it is named as soon as it is clear, and again once it is twice as far.
+    *_, said = (w for w in found.stats.warnings if "sigmas from where it is set: add -0." in w)
     assert ": time_offset_s is " in said
+    assert float(said.split(": add ")[1].split(" ")[0]) == pytest.approx(-0.15, abs=0.05)
     last = found.health_reason[-1]
     assert last.cause is Cause.CONTRADICTION
     assert "far off what stamp_sigma_s allows for" in last.text

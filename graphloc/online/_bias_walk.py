@@ -52,7 +52,7 @@ class BiasWalk:
 
     def _told(self, lag: Lag, now: KnownBias, samples: Callable[[], ImuSeries]) -> str:
         """Raise the walk where how far the biases have gone since tells it, and return a line on that; or empty."""
-        found = went_too_far(self._known[:-1], now, lag.problem.links)
+        found = went_too_far(self._known[:-1], now, lag.problem.links, lasting=True)
         if found is None:
             return ""
         k, times = found

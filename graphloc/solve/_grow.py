@@ -12,7 +12,7 @@ from graphloc.build import Past, Problem, StartPrior, without_imu
 from graphloc.recording import Progress
 from graphloc.solve._marginals import marginals
 from graphloc.solve._passes import cost_as_configured
-from graphloc.solve.bias_walk import KEYS, BiasWanders, known_bias, went_too_far
+from graphloc.solve.bias_walk import KEYS, BiasWanders, KnownBias, known_bias, went_too_far
 from graphloc.solve.decide import PredictedCovariance, Stage, Verdicts, agrees, decisions, predicted_by, weigh
 from graphloc.solve.stretch import (
     StretchStep,
@@ -79,7 +79,7 @@ def grow(
         window = GrownWindow(problem, estimate, first, known, until, prior)
         used, step, verdicts = _solve_grown(window)
         if doubt_imu and (found := _without_imu(window, before)) is not None:
-            if (wanders := _wanders(problem, estimate, pasts)) is not None:
+            if (wanders := _wanders(problem, estimate, start, pasts)) is not None:
                 raise wanders
             problem, step, verdicts, more = found
             used += more
@@ -105,11 +105,15 @@ def _without_imu(window: GrownWindow, before: gtsam.Values) -> tuple[Problem, St
     return rest, step, verdicts, iterations
 
 
-def _wanders(problem: Problem, values: gtsam.Values, before: Sequence[tuple[int, Past]]) -> BiasWanders | None:
+def _wanders(
+    problem: Problem, values: gtsam.Values, start: StartPrior, before: Sequence[tuple[int, Past]]
+) -> BiasWanders | None:
     """Return how far the biases wander in what was known at some states, each by the data before it; None: they do not, or are not to be adapted."""
     if not problem.config.sensors[problem.imu.sensor].adapt_noise:
         return None
-    known = [known_bias(problem, values, k, past) for k, past in before]
+    begin_ns = int(problem.timeline.stamps_ns[0])
+    known = [KnownBias(begin_ns, start.bias.vector(), np.diagonal(start.bias_cov))]
+    known += [known_bias(problem, values, k, past) for k, past in before]
     found = [w for n, now in enumerate(known) if (w := went_too_far(known[:n], now, problem.links)) is not None]
     return BiasWanders({KEYS[k]: times for k, times in found[-1:]}) if found else None
 

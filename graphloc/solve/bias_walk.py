@@ -29,7 +29,7 @@ WANDERS_S = 60.0
 KEYS = ("accel_bias_instability_ug", "gyro_bias_instability_deg_per_h")
 """What is configured of accelerometers and gyroscopes."""
 _WANDERS = 3.0  # sigmas of its random walk over that: smoothed, a bias that walks so moves by less than two
-_TOO_FAR = 1e-5
+_TOO_FAR, _A_PART = 1e-5, 0.01
 _MOST_STEP, _LEAST_STEP = 10.0, 1.3  # what is known is too sure as well, so more is not believed at once
 _LEAST_SHARE = 0.1  # of the walk, that a bias may go though nothing measures it: rounding
 _UNLIKELY, _LEAST_TIMES = 1e-4, 2.0
@@ -77,44 +77,54 @@ def wandered(problem: Problem, values: gtsam.Values) -> Array:
     return np.asarray(gone.reshape(2, 3).max(axis=1))
 
 
-def went_too_far(before: Sequence[KnownBias], now: KnownBias, links: InertialLink) -> tuple[int, float] | None:
+def went_too_far(
+    before: Sequence[KnownBias], now: KnownBias, links: InertialLink, *, lasting: bool = False
+) -> tuple[int, float] | None:
     """Return which biases went farther than they may have (0: of accelerometers, 1: of gyroscopes), and how many times the walk explains it; None: none did.
 
     An estimate that is as good as it says goes, from b with covariance P to b' with P', by N(0, P + Q - P'), Q: the walk in between.
 
     Args:
-        before: of the same estimate, with less data.
+        before: of the same estimate, with less data, by stamp. lasting: whether they have to go on in two parts of that time: where an
+            estimate is put right they go once.
     """
-    gone = []
-    for then in before:
-        walk = links.bias_steps((now.stamp_ns - then.stamp_ns) * 1e-9) ** 2
-        each = np.array([(now.bias - then.bias) ** 2, then.variance - now.variance, walk])
-        gone += [(k, each[:, part]) for k, part in enumerate((slice(3), slice(3, 6)))]
-    if not gone:
+
+    def likely(then: KnownBias, later: KnownBias, k: int) -> float:
+        return _likely(_gone(then, later, links, k))
+
+    def lasts(then: KnownBias, k: int) -> bool:
+        between = (mid for mid in before if mid.stamp_ns > then.stamp_ns)
+        return any(max(likely(then, mid, k), likely(mid, now, k)) < _A_PART for mid in between)
+
+    pairs = [(then, k) for then in before for k in range(2) if not lasting or lasts(then, k)]
+    if not pairs:
         return None
     # Those that wander bend the others: the least likely are they.
-    k, least = min(gone, key=lambda found: _likely(found[1]))
-    times = _needed(least)
-    return (k, times) if _likely(least) < _TOO_FAR and times > _LEAST_STEP else None
+    then, k = min(pairs, key=lambda pair: likely(pair[0], now, pair[1]))
+    times = _needed(_gone(then, now, links, k))
+    return (k, times) if likely(then, now, k) < _TOO_FAR and times > _LEAST_STEP else None
+
+
+def _gone(then: KnownBias, now: KnownBias, links: InertialLink, k: int) -> Array:
+    """Return (3, 3), of each axis of accelerometers or gyroscopes the square of how far it went, P - P' and Q."""
+    walk = links.bias_steps((now.stamp_ns - then.stamp_ns) * 1e-9) ** 2
+    each = np.array([(now.bias - then.bias) ** 2, then.variance - now.variance, walk])
+    return each[:, 3 * k : 3 * k + 3]
 
 
 def _squares(gone: Array, times: float) -> float:
-    """Return the sum of the squares by which three biases went, by their variance with so many times the walk.
-
-    Args:
-        gone: (3, 3), of each axis the square, P - P' and Q as in `BiasWalk`.
-    """
+    """Return the sum of the squares by which three biases went, by their variance with so many times the walk; `gone`: as `_gone` gives it."""
     squares, known, walk = gone
     return float((squares / np.maximum(known + times**2 * walk, _LEAST_SHARE * walk)).sum())
 
 
 def _likely(gone: Array) -> float:
-    """Return how likely it is that they went as far as they did, or farther; `gone` as of `_squares`."""
+    """Return how likely it is that they went as far as they did, or farther; `gone`: likewise."""
     return float(chdtrc(gone.shape[1], _squares(gone, 1.0)))
 
 
 def _needed(gone: Array) -> float:
-    """Return how many times the walk explains it, at most `_MOST_STEP`; `gone` as of `_squares`."""
+    """Return how many times the walk explains it, at most `_MOST_STEP`; `gone`: likewise."""
 
     def beyond(times: float) -> float:
         return _squares(gone, times) - float(gone.shape[1])
