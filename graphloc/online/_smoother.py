@@ -394,7 +394,7 @@ class OnlineSmoother:
         self._setup = self._setup.without_start_heading()
         persistent.datum, persistent.heights_m = started.datum, started.heights_m
         persistent.heading = started.heading
-        persistent.noise.at_least(started.noise_scale, started.gyro_noise, started.accel_noise)
+        persistent.noise.at_least(started.noise_scale, started.gyro_noise, started.accel_noise, *started.bias_walk)
         persistent.sensor_noise.enlarge(started.sensor_noise)
         persistent.heading_check.begin()
         for sample in samples:
