@@ -56,8 +56,9 @@ class BiasWalk:
         if found is None:
             return ""
         k, times = found
-        times = min(times, MOST_TIMES / self.times[k])
-        self.times[k] *= times
+        if self.times[k] >= MOST_TIMES:
+            return ""
+        self.times[k] = min(self.times[k] * times, MOST_TIMES)
         name = samples().sensor
         imu = lag.problem.config.sensors[name]
         return too_steady(name, imu, self.of(imu))

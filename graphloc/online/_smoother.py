@@ -302,9 +302,10 @@ class OnlineSmoother:
                 self._rebuild(f"position jump of {', '.join(jumped)}")
                 return self._estimate()
             persistent = self._persistent
-            if noise := persistent.sensor_noise.changed(tracking.lag) or persistent.noise.raised(
-                tracking.lag, tracking.samples
-            ):
+            if noise := persistent.sensor_noise.changed(tracking.lag):
+                self._rebuild(noise)
+                return self._estimate()
+            if noise := persistent.noise.raised(tracking.lag, tracking.samples):
                 self._rebuild(noise, persistent.noise.misled)
                 return self._estimate()
             return tracking.estimate()
