@@ -34,7 +34,7 @@ _MOST_STEP, _LEAST_STEP = 10.0, 1.3  # what is known is too sure as well, so mor
 _LEAST_SHARE = 0.1  # of the walk, that a bias may go though nothing measures it: rounding
 _UNLIKELY, _LEAST_TIMES = 1e-4, 2.0
 MOST_TIMES = 100.0
-"""No bias walks so many times faster than configured."""
+"""Most that the walk is raised: online in all, offline by one round of variance components."""
 
 
 class BiasWanders(Exception):
@@ -102,7 +102,7 @@ def _squares(gone: Array, times: float) -> float:
     """Return the sum of the squares by which three biases went, by their variance with so many times the walk.
 
     Args:
-        gone: (3, 3), of each axis the square, P - P' and Q as in `BiasWalk`.
+        gone: (3, 3), of each axis the square, P - P' and Q as in `went_too_far`.
     """
     squares, known, walk = gone
     return float((squares / np.maximum(known + times**2 * walk, _LEAST_SHARE * walk)).sum())
