@@ -14,6 +14,7 @@ from graphloc.config import ImuConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.frames import Array, wrap_angle
 from graphloc.online._bias_walk import BiasWalk
+from graphloc.online._lag import Lag
 from graphloc.online._waiting import Waiting
 from graphloc.replay import replay
 from graphloc.solution import Solution
@@ -127,6 +128,29 @@ def test_what_a_long_start_found_is_taken(warm: SimulatedRun, monkeypatch: pytes
     taken = tracking.lag.problem.links.bias_steps(1.0)[3:] / IMU.gyro_bias_walk_radps
     assert taken == pytest.approx(float(said.split("is 20, ")[1].split(" ")[0]) / 20.0, rel=0.01)
     assert taken.min() > 2.0
+
+
+def test_a_window_that_is_built_anew_forgets_what_was_known(
+    cold: SimulatedRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What data told that are weighed otherwise now, or are left out, is no measure of how far a bias goes."""
+    begin_ns, whole, begun, again = int(cold.truth.stamps_ns[0]), Lag.commit, BiasWalk.begin, list[int]()
+
+    def counted(self: BiasWalk) -> None:
+        again.append(1)
+        begun(self)
+
+    def fails(_self: Lag) -> None:
+        monkeypatch.setattr(Lag, "commit", whole)
+        monkeypatch.setattr(BiasWalk, "begin", counted)
+        raise RuntimeError("planted")
+
+    online, came = smoother(cold), arrivals_of(cold)
+    feed(online, cold, [a for a in came if a.m.stamp_ns - begin_ns < 9 * SECOND])
+    monkeypatch.setattr(Lag, "commit", fails)
+    fed = feed(online, cold, [a for a in came if 9 * SECOND <= a.m.stamp_ns - begin_ns < 11 * SECOND])
+    assert any("rebuilt" in event for event in fed.events)
+    assert again == [1]
 
 
 # A Kalman filter of six biases, each measured once a second

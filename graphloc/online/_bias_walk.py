@@ -31,7 +31,7 @@ class BiasWalk:
         self.begin()
 
     def begin(self) -> None:
-        """A window has begun: what its biases do is no walk until they have settled."""
+        """A window has begun, or was built anew: what was known before is not by the same data, nor as they are weighed now."""
         self._known: list[KnownBias] = []
 
     def of(self, sensor: Any) -> Any:

@@ -292,6 +292,7 @@ class OnlineSmoother:
             self._events += tracking.news()
             if (doubted := tracking.doubt_imu(until_ns)) is not None:
                 self._say(doubted)
+                self._persistent.noise.walk.begin()
                 return self._estimate()
             if lost_s := tracking.lag.lost_s:
                 why = f"for {lost_s:.0f} s no absolute sensor agreed, unless its error had jumped"
@@ -327,6 +328,7 @@ class OnlineSmoother:
         log.warning("online: %s", why)
         assert self._tracking is not None
         assert self._intake.newest is not None
+        self._persistent.noise.walk.begin()
         try:
             self._say(self._tracking.rebuild(why, self._intake.newest.stamp_ns, misled))
         except SolveError as error:
