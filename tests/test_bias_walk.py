@@ -14,9 +14,14 @@ from graphloc.config import ImuConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.frames import Array, wrap_angle
 from graphloc.online._bias_walk import BiasWalk
+from graphloc.online._lag import Lag
+from graphloc.online._waiting import Waiting
 from graphloc.replay import replay
 from graphloc.solution import Solution
+from graphloc.solve.bias_walk import MOST_TIMES
+from tests.faults import arrivals_of, feed
 from tests.slowly import simulate_slowly
+from tests.test_online_faults import smoother
 
 SECOND = 1_000_000_000
 IMU = ImuConfig.model_validate({"topic": "/imu"})
@@ -110,6 +115,44 @@ def test_online_the_walk_is_raised_under_way(cold: SimulatedRun, warm: Simulated
     )  # 10 without more walk, 6 where what was estimated without it is not believed less
 
 
+def test_what_a_long_start_found_is_taken(warm: SimulatedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its walk was said to be taken, and was not."""
+    begin_ns = int(warm.truth.stamps_ns[0])
+    monkeypatch.setattr(Waiting, "due", lambda _self, newest_ns: newest_ns - begin_ns > 86 * SECOND)
+    monkeypatch.setattr(BiasWalk, "raised", lambda *_: "")
+    online = smoother(warm)
+    fed = feed(online, warm, arrivals_of(warm))
+    (said,) = [event for event in fed.events if "biases change more" in event]
+    tracking = online._tracking  # noqa: SLF001 - the walk is in no output
+    assert tracking is not None
+    taken = tracking.lag.problem.links.bias_steps(1.0)[3:] / IMU.gyro_bias_walk_radps
+    assert taken == pytest.approx(float(said.split("is 20, ")[1].split(" ")[0]) / 20.0, rel=0.01)
+    assert taken.min() > 2.0
+
+
+def test_a_window_that_is_built_anew_forgets_what_was_known(
+    cold: SimulatedRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What data told that are weighed otherwise now, or are left out, is no measure of how far a bias goes."""
+    begin_ns, whole, begun, again = int(cold.truth.stamps_ns[0]), Lag.commit, BiasWalk.begin, list[int]()
+
+    def counted(self: BiasWalk) -> None:
+        again.append(1)
+        begun(self)
+
+    def fails(_self: Lag) -> None:
+        monkeypatch.setattr(Lag, "commit", whole)
+        monkeypatch.setattr(BiasWalk, "begin", counted)
+        raise RuntimeError("planted")
+
+    online, came = smoother(cold), arrivals_of(cold)
+    feed(online, cold, [a for a in came if a.m.stamp_ns - begin_ns < 9 * SECOND])
+    monkeypatch.setattr(Lag, "commit", fails)
+    fed = feed(online, cold, [a for a in came if 9 * SECOND <= a.m.stamp_ns - begin_ns < 11 * SECOND])
+    assert any("rebuilt" in event for event in fed.events)
+    assert again == [1]
+
+
 # A Kalman filter of six biases, each measured once a second
 
 
@@ -151,6 +194,14 @@ def test_the_walk_is_raised_to_what_it_is(part: int) -> None:
     assert ("gyro" in said) == (part == 1)
     assert 8.0 < walk.times[part] < 60.0
     assert walk.times[1 - part] < 1.5
+
+
+def test_at_its_most_it_is_raised_no_more() -> None:
+    """Each line has the window rebuilt: every twenty seconds, for nothing."""
+    walk = BiasWalk()
+    walk.times[:] = MOST_TIMES
+    assert not filtered(walk, np.full(6, 3000.0), 120, np.random.default_rng(3))
+    assert (walk.times == MOST_TIMES).all()
 
 
 def test_where_the_heading_is_hardly_known_nothing_is_told() -> None:

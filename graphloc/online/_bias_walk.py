@@ -31,7 +31,7 @@ class BiasWalk:
         self.begin()
 
     def begin(self) -> None:
-        """A window has begun: what its biases do is no walk until they have settled."""
+        """A window has begun, or was built anew: what was known before is not by the same data, nor as they are weighed now."""
         self._known: list[KnownBias] = []
 
     def of(self, sensor: Any) -> Any:
@@ -56,8 +56,9 @@ class BiasWalk:
         if found is None:
             return ""
         k, times = found
-        times = min(times, MOST_TIMES / self.times[k])
-        self.times[k] *= times
+        if self.times[k] >= MOST_TIMES:
+            return ""
+        self.times[k] = min(self.times[k] * times, MOST_TIMES)
         name = samples().sensor
         imu = lag.problem.config.sensors[name]
         return too_steady(name, imu, self.of(imu))

@@ -47,12 +47,15 @@ class Constants:
                 self._known[key] = found
 
     def begin(self, anchor: Anchor, state: Sequence[int]) -> None:
-        """Stage those that are known only together with the anchor's state, by the keys of its pose, velocity and bias."""
-        for constant, key in self._settings():
-            if (known := self._known.pop(key, None)) is not None:
+        """Stage those that are known together with the anchor's state, by the keys of its pose, velocity and bias, and those that correct a setting."""
+        settings = {key: constant for constant, key in self._settings()}
+        for key, known in [*self._known.items()]:
+            if key in settings or known.gain.any():
+                del self._known[key]
                 self._window.guess(key, known.value, 0.0)
                 self._window.add([anchor.conditional_factor(known, state, key)])
-                self._hold(constant, key, known.value)
+            if key in settings:
+                self._hold(settings[key], key, known.value)
 
     def _settings(self) -> Iterator[tuple[Constant, int]]:
         """Yield the constants that correct a setting, with their keys."""

@@ -66,7 +66,6 @@ class ImuNoise:
         said = self.walk.raised(lag, samples) or self._contradicted(lag) or self._too_quiet(lag, samples)
         if said:
             self.misled = float((self.walk.times / before).max())
-            self.walk.begin()
         return said
 
     def _contradicted(self, lag: Lag) -> str:

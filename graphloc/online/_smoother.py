@@ -292,6 +292,7 @@ class OnlineSmoother:
             self._events += tracking.news()
             if (doubted := tracking.doubt_imu(until_ns)) is not None:
                 self._say(doubted)
+                self._persistent.noise.walk.begin()
                 return self._estimate()
             if lost_s := tracking.lag.lost_s:
                 why = f"for {lost_s:.0f} s no absolute sensor agreed, unless its error had jumped"
@@ -302,9 +303,10 @@ class OnlineSmoother:
                 self._rebuild(f"position jump of {', '.join(jumped)}")
                 return self._estimate()
             persistent = self._persistent
-            if noise := persistent.sensor_noise.changed(tracking.lag) or persistent.noise.raised(
-                tracking.lag, tracking.samples
-            ):
+            if noise := persistent.sensor_noise.changed(tracking.lag):
+                self._rebuild(noise)
+                return self._estimate()
+            if noise := persistent.noise.raised(tracking.lag, tracking.samples):
                 self._rebuild(noise, persistent.noise.misled)
                 return self._estimate()
             return tracking.estimate()
@@ -326,6 +328,7 @@ class OnlineSmoother:
         log.warning("online: %s", why)
         assert self._tracking is not None
         assert self._intake.newest is not None
+        self._persistent.noise.walk.begin()
         try:
             self._say(self._tracking.rebuild(why, self._intake.newest.stamp_ns, misled))
         except SolveError as error:
@@ -394,7 +397,7 @@ class OnlineSmoother:
         self._setup = self._setup.without_start_heading()
         persistent.datum, persistent.heights_m = started.datum, started.heights_m
         persistent.heading = started.heading
-        persistent.noise.at_least(started.noise_scale, started.gyro_noise, started.accel_noise)
+        persistent.noise.at_least(started.noise_scale, started.gyro_noise, started.accel_noise, *started.bias_walk)
         persistent.sensor_noise.enlarge(started.sensor_noise)
         persistent.heading_check.begin()
         for sample in samples:

@@ -59,6 +59,7 @@ class Started:
         heights_m: configured heights (m, up in world), by sensor.
         heading: where no sensor measures it, how far it may be off; None: one does, or the motion told it.
         noise_scale: factor on the IMU noise. gyro_noise, accel_noise: beside it, on that of each.
+        bias_walk: factors on the walk of the biases of accelerometers and of gyroscopes.
         sensor_noise: factors on sigmas of other sensors, by sensor and key of its configuration.
         before: what slow errors that are left out, and the IMU's mount, did to that state; None: nothing that is known.
         notes: what the alignment was based on. warnings: on noise that is taken to be larger than configured. rows: ledger rows of what was measured before the first state.
@@ -74,6 +75,7 @@ class Started:
     noise_scale: float
     gyro_noise: float
     accel_noise: float
+    bias_walk: tuple[float, float]
     sensor_noise: Mapping[str, Mapping[str, float]]
     before: BeforeStart | None
     notes: tuple[str, ...]
@@ -192,6 +194,10 @@ def _solved(setup: Setup, recording: Recording, datum: Datum, *, told: bool, nea
         noise_scale=result.noise_scale,
         gyro_noise=taken_imu.gyro_noise_radps / imu.gyro_noise_radps,
         accel_noise=taken_imu.accel_noise_mps2 / imu.accel_noise_mps2,
+        bias_walk=(
+            taken_imu.accel_bias_walk_mps2 / imu.accel_bias_walk_mps2,
+            taken_imu.gyro_bias_walk_radps / imu.gyro_bias_walk_radps,
+        ),
         sensor_noise={stream.name: taken[stream.name].sigmas_over(stated[stream.name]) for stream in problem.streams},
         before=_before(result, k),
         notes=result.notes,

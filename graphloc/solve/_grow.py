@@ -113,7 +113,10 @@ def _wanders(
         return None
     begin_ns = int(problem.timeline.stamps_ns[0])
     known = [KnownBias(begin_ns, start.bias.vector(), np.diagonal(start.bias_cov))]
-    known += [known_bias(problem, values, k, past) for k, past in before]
+    try:
+        known += [known_bias(problem, values, k, past) for k, past in before]
+    except np.linalg.LinAlgError:  # some data do not determine them
+        return None
     found = [w for n, now in enumerate(known) if (w := went_too_far(known[:n], now, problem.links)) is not None]
     return BiasWanders({KEYS[k]: times for k, times in found[-1:]}) if found else None
 

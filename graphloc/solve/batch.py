@@ -177,8 +177,14 @@ class _Underway:
             wandering = with_needed_walk(problem, settled.values, settled.verdicts, self.begun.prior)
             if wandering is None:
                 return
+            before, begun, choice = self._problem, self.begun, self.solved.choice()
             del self.solved, settled  # and its graph, before the next one is made
-            self._solve_first(replace(wandering, usual_motion=None))
+            try:
+                self._solve_first(replace(wandering, usual_motion=None))
+            except SolveError:  # it cannot be solved so
+                self._problem = before
+                self._hold(begun, choice.settled_again(begun.prior, self._progress))
+                return
 
     def raise_noise_of_sensors(self) -> None:
         """Solve it anew where sensors that scatter more than they state may have misled a start by the motion alone.
