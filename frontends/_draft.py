@@ -33,6 +33,7 @@ from graphloc.frontends._reports import (
     through_water,
 )
 from graphloc.frontends._streams import COURSE, HEADING
+from graphloc.frontends._tf import WORLD_NAMES
 from graphloc.frontends._turns import WANDERS_DEG
 from graphloc.frontends.decode import IMU, POINT, VECTOR
 
@@ -532,7 +533,8 @@ def _of_antenna(twist: VelocityReport, gnss: GnssReport | None) -> str | None:
         return None
     if gnss.topic.partition(" ")[0] == twist.topic.partition(" ")[0]:
         return "of the same topic"
-    return f"both have the frame '{twist.frame_id}'" if twist.frame_id and twist.frame_id == gnss.frame_id else None
+    told = twist.frame_id and twist.frame_id == gnss.frame_id and twist.frame_id.strip("/") not in WORLD_NAMES
+    return f"both have the frame '{twist.frame_id}'" if told else None
 
 
 def _antenna_lines(frame: str | None, evidence: str, keeps_m: float) -> list[str]:

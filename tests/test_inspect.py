@@ -458,6 +458,16 @@ def test_a_velocity_in_the_frame_of_the_fixes_is_of_their_antenna(frame: str, an
     assert (block.antenna, block.mount_sigma_m) == (antenna, 1.0)
 
 
+def test_velocities_and_fixes_in_a_frame_of_the_world_tell_no_antenna(tmp_path: Path) -> None:
+    make = Messages(2)
+    items = [*drive(make), *velocities(make, "enu", "map")[0]]
+    for topic, _, m in items:
+        if topic == "/fix":
+            m.header.frame_id = "map"
+    _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert config.sensors["gnss_velocity"].antenna == ""
+
+
 @pytest.mark.parametrize(
     ("axes", "said", "enabled"),
     [("enu", "east, north, up", True), ("ned", "north, east, down", True), ("body", "forward, left, up", False)],
