@@ -29,6 +29,7 @@ WANDERS_S = 60.0
 KEYS = ("accel_bias_instability_ug", "gyro_bias_instability_deg_per_h")
 """What is configured of accelerometers and gyroscopes."""
 _WANDERS = 3.0  # sigmas of its random walk over that: smoothed, a bias that walks so moves by less than two
+# Probabilities: of some ten looks every ten seconds one finds it by chance about once in 150 h; and that of each part of the time.
 _TOO_FAR, _A_PART = 1e-6, 0.01
 _MOST_STEP, _LEAST_STEP = 10.0, 1.3  # what is known is too sure as well, so more is not believed at once
 _LEAST_SHARE = 0.1  # of the walk, that a bias may go though nothing measures it: rounding
