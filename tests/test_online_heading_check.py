@@ -27,7 +27,7 @@ SECOND = 1_000_000_000
 
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
-    scenario = replace(bl_scenario(1, "clean"), duration_s=58.0, pose_hz=0.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0)
+    scenario = replace(bl_scenario(1, "clean"), duration_s=66.0, pose_hz=0.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0)
     return sparsely(simulate(scenario, 4), 2)
 
 

@@ -33,6 +33,7 @@ class BiasWalk:
     def begin(self) -> None:
         """A window has begun, or was built anew: what was known before is not by the same data, nor as they are weighed now."""
         self._known: list[KnownBias] = []
+        self._since_ns: int | None = None
 
     def of(self, sensor: Any) -> Any:
         """Return the configuration of the IMU with its walk raised."""
@@ -44,7 +45,10 @@ class BiasWalk:
         R = newest.pose.rotation().matrix()
         if (R @ newest.pose_cov[:3, :3] @ R.T)[2, 2] > _HEADING_RAD**2:
             self.begin()
-        elif not known or newest.stamp_ns - known[-1].stamp_ns >= _EVERY_S * 1e9:
+            return ""
+        if self._since_ns is None:
+            self._since_ns = newest.stamp_ns
+        if newest.stamp_ns - (known[-1].stamp_ns if known else self._since_ns) >= _EVERY_S * 1e9:
             now = KnownBias(newest.stamp_ns, newest.bias.vector(), np.diagonal(newest.bias_cov))
             self._known = [*known[-_KEPT:], now]
             return self._told(lag, now, samples) if known else ""

@@ -99,6 +99,11 @@ class HeadingCheck:
         self.within_rad = np.inf
 
     @property
+    def doubtful(self) -> bool:
+        """Whether the last check found the heading wrong."""
+        return self._wrong > 0
+
+    @property
     def confirmed(self) -> bool:
         """Whether the last checks found the heading right."""
         return self._fits >= _IN_A_ROW

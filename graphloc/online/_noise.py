@@ -53,16 +53,18 @@ class ImuNoise:
         """Return the configuration of the IMU with its noise raised but for the scale."""
         return noisier_imu(self.walk.of(sensor), self.gyro, self.accel)
 
-    def raised(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
+    def raised(self, lag: Lag, samples: Callable[[], ImuSeries], *, heading_doubtful: bool = False) -> str:
         """Raise the noise where that is needed; return a line on that, or empty.
 
         Args:
-            samples: gives those of the window.
+            samples: gives those of the window. heading_doubtful: the heading may be wrong: that bends the biases as well.
         """
         # Until relinearised, the cost of a step includes how far its states have moved since.
         if not self._adapt or not lag.fresh:
             return ""
         self.misled, before = 1.0, self.walk.times.copy()
+        if heading_doubtful:
+            self.walk.begin()
         said = self.walk.raised(lag, samples) or self._contradicted(lag) or self._too_quiet(lag, samples)
         if said:
             self.misled = float((self.walk.times / before).max())

@@ -306,7 +306,8 @@ class OnlineSmoother:
             if noise := persistent.sensor_noise.changed(tracking.lag):
                 self._rebuild(noise)
                 return self._estimate()
-            if noise := persistent.noise.raised(tracking.lag, tracking.samples):
+            doubtful = persistent.heading_check.doubtful
+            if noise := persistent.noise.raised(tracking.lag, tracking.samples, heading_doubtful=doubtful):
                 self._rebuild(noise, persistent.noise.misled)
                 return self._estimate()
             return tracking.estimate()
