@@ -72,3 +72,24 @@ def test_what_a_long_window_holds_counts_once() -> None:
 @pytest.mark.parametrize("likely", [RuntimeError("Factor is exactly singular"), (np.nan, np.nan, np.nan)])
 def test_a_window_of_which_nothing_can_be_told_stands(likely: Any) -> None:
     assert said(likely, 10.0, 20.0) == ["", ""]
+
+
+@pytest.mark.parametrize("doubtful", [False, True])
+def test_biases_tell_no_walk_while_the_heading_is_doubtful(*, doubtful: bool) -> None:
+    """A heading that may be wrong bends them as well."""
+    noise, links = ImuNoise(adapt=True), SimpleNamespace(bias_steps=lambda dt_s: np.full(6, 1e-5 * np.sqrt(dt_s)))
+    problem = SimpleNamespace(config=SimpleNamespace(sensors={"imu": SENSOR}), links=links)
+    lines = []
+    for k in range(6):
+        newest = steady(SECOND + 10 * k * SECOND)
+        newest.bias = gtsam.imuBias.ConstantBias(np.zeros(3), np.full(3, 1e-3 * k))
+        lag: Any = SimpleNamespace(
+            fresh=True,
+            lag_s=10.0,
+            newest=newest,
+            misfit=lambda: 1.0,
+            problem=problem,
+            likelihoods=lambda _: np.zeros(4),
+        )
+        lines.append(noise.raised(lag, scattering, heading_doubtful=doubtful))
+    assert any("gyro_bias_instability" in line for line in lines) is not doubtful

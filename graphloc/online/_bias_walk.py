@@ -14,9 +14,8 @@ from graphloc.solve.bias_walk import KEYS, MOST_TIMES, KnownBias, too_steady, we
 
 _EVERY_S = 10.0
 _KEPT = 6  # of these: a minute; a bias that creeps shows after the longest
-_HEADING_RAD = (
-    0.1  # sigma: from which it turns the biases of accelerometers with it, by more than their covariance tells
-)
+# 1 sigma: from which the heading turns the biases of accelerometers with it, by more than their covariance tells.
+_HEADING_RAD = 0.1
 
 
 class BiasWalk:
