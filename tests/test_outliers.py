@@ -604,6 +604,33 @@ def test_a_run_that_cannot_be_solved_with_its_jumps_is_solved_without(monkeypatc
     assert found.values.atPose3(last).equals(right.values.atPose3(last), 1e-3)
 
 
+@pytest.mark.parametrize("of_the_sensors", [False, True])
+def test_a_run_that_cannot_be_solved_with_other_noise_is_solved_as_it_was(
+    of_the_sensors: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With that of the sensors, the run failed."""
+    problem, tries = lone_problem(), list[int]()
+    right = batch.solve_batch(problem)
+
+    def once(*args: Any, **options: Any) -> Any:
+        tries.append(1)
+        if len(tries) > 1:
+            raise SolveError("not with this")
+        begun, solved = first_solution(*args, **options)
+        return begun._replace(start=replace(begun.start, by_motion=of_the_sensors)), solved
+
+    monkeypatch.setattr(batch, "first_solution", once)
+    if of_the_sensors:
+        monkeypatch.setattr(batch, "CONTRADICTION", 0.0)
+        monkeypatch.setattr(batch, "scattering", lambda *_, **__: {"gnss": {"sigma_scale": 2.0}})
+    else:
+        monkeypatch.setattr(batch, "with_needed_walk", lambda given, *_: given)
+    found = batch.solve_batch(problem)
+    assert len(tries) == 2
+    last = keys.pose(len(problem.timeline) - 1)
+    assert found.values.atPose3(last).equals(right.values.atPose3(last), 1e-3)
+
+
 def test_jumps_that_do_not_make_the_run_clearly_more_probable_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a receiver whose fixes wandered by metres within seconds seven were: 15 m off, and 3 m without them."""
     problem = lone_problem()

@@ -175,15 +175,8 @@ class _Underway:
             if not problem.config.sensors[problem.imu.sensor].adapt_noise:
                 return
             wandering = with_needed_walk(problem, settled.values, settled.verdicts, self.begun.prior)
-            if wandering is None:
-                return
-            before, begun, choice = self._problem, self.begun, self.solved.choice()
-            del self.solved, settled  # and its graph, before the next one is made
-            try:
-                self._solve_first(replace(wandering, usual_motion=None))
-            except SolveError:  # it cannot be solved so
-                self._problem = before
-                self._hold(begun, choice.settled_again(begun.prior, self._progress))
+            del settled  # and its graph, before the next one is made
+            if wandering is None or not self._solved_anew(replace(wandering, usual_motion=None)):
                 return
 
     def raise_noise_of_sensors(self) -> None:
@@ -196,10 +189,8 @@ class _Underway:
                 return
             problem = self.solved.problem
             times = scattering(problem, self.solved.settled.verdicts, denied=True)
-            if not times:
+            if not times or not self._solved_anew(replace(with_sensor_noise(problem, times), usual_motion=None)):
                 return
-            del self.solved  # and its graph, before the next one is made
-            self._solve_first(replace(with_sensor_noise(problem, times), usual_motion=None))
 
     def take_jumps(self) -> None:
         """Solve it anew with the position jumps that the solution shows, while that is clearly more probable."""
@@ -208,7 +199,7 @@ class _Underway:
             if jumping is None:
                 return
             cost = self._cost(self._problem)
-            if not self._more_probable(jumping, cost - _OF_A_JUMP * (jumps_in(jumping) - jumps_in(self._problem))):
+            if not self._solved_anew(jumping, cost - _OF_A_JUMP * (jumps_in(jumping) - jumps_in(self._problem))):
                 return
 
     def leave_out_returns(self) -> None:
@@ -221,10 +212,10 @@ class _Underway:
         cost, times, before = self._cost(whole), max(misfit, 1.0), self._problem
         # What the IMU is off by without fixes is no reason to doubt it.
         self._solve = partial(self._solve, doubt_imu=False)
-        if not self._more_probable(doubted.left_out_of(whole), cost - times * doubted.price(whole)):
+        if not self._solved_anew(doubted.left_out_of(whole), cost - times * doubted.price(whole)):
             return
         off = doubted.still_off(whole, self.solved.choice(), self._cost(self._problem))
-        if off.each and self._more_probable(off.left_out_of(whole), cost - times * off.price(whole)):
+        if off.each and self._solved_anew(off.left_out_of(whole), cost - times * off.price(whole)):
             self._configured = off.left_out_of(self._configured)
         else:
             del self.solved  # and its graph, before the next one is made
@@ -234,13 +225,13 @@ class _Underway:
         """Return the cost (nats) of the solution by a problem with its measurements."""
         return cost_of_run(problem, self.solved.settled.values, self.begun.prior)
 
-    def _more_probable(self, other: Problem, lowest: float) -> bool:
-        """Return whether another problem costs less (nats) than the lowest; else the solution stays what it was."""
+    def _solved_anew(self, other: Problem, lowest: float = np.inf) -> bool:
+        """Solve another problem from its start; return whether it could be, and costs less (nats) than the lowest: else the solution stays what it was."""
         problem, begun, before = self._problem, self.begun, self.solved.choice()
         del self.solved  # and its graph, before the next one is made
         try:
             self._solve_first(other)
-            if self._cost(other) < lowest:
+            if np.isinf(lowest) or self._cost(other) < lowest:
                 return True
         except SolveError:
             pass  # it cannot be solved so
