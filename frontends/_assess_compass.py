@@ -79,7 +79,7 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
         not fits_course
         and by_gyro is not None
         and (stream.msgtype != IMU or abs(fit.offset_deg) < _RELATIVE_DEG or quarter)
-        and follows_turning(turning, stamps_ns, _in_enu(angle, fit.convention))
+        and follows_turning(turning, stamps_ns, in_enu(angle, fit.convention))
     )
     by_turns = sideways and not quarter  # no course tells how it is mounted
     return CompassReport(
@@ -114,7 +114,8 @@ def _heard(courses: Courses | None, stamps_ns: NDArray[np.int64]) -> Courses | N
     return Courses(courses.stamps_ns[within], courses.course_rad[within])
 
 
-def _in_enu(angle: Array, convention: str) -> Array:
+def in_enu(angle: Array, convention: str) -> Array:
+    """Return headings (N,), rad, as yaw from east, counter-clockwise."""
     return angle if convention == "enu" else np.pi / 2.0 - angle
 
 
@@ -145,7 +146,7 @@ def _beside_courses(
         usual: of a maker's driver, the convention that it comes with.
     """
     measured = np.interp(courses_s, t_s, angle)
-    apart = {convention: _in_enu(measured, convention) - courses.course_rad for convention in ("enu", "ned")}
+    apart = {convention: in_enu(measured, convention) - courses.course_rad for convention in ("enu", "ned")}
     fits = {convention: _beside_either_way(off) for convention, off in apart.items()}
     turned = float(np.degrees(np.sqrt(max(0.0, -2.0 * np.log(max(abs(np.exp(1j * courses.course_rad).mean()), 1e-9))))))
     straight = turned < _STRAIGHT_DEG

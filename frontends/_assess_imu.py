@@ -211,28 +211,38 @@ def _mount_yaw(
     return yaw, found.error_deg if askew else None, said
 
 
-def turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Turning:
+class Inertial(NamedTuple):
+    """What an IMU tells: the motion, in the axes of the vessel, and its usable samples, in its own."""
+
+    felt: Felt
+    series: ImuSeries
+
+
+def inertial_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Inertial:
+    """Return what an IMU tells whose mount is known or guessed."""
+    series = _series_of(imu, report)
+    gravity_mps2 = 0.0 if report.gravity == "removed" else STANDARD_GRAVITY_MPS2
+    return Inertial(Felt.of(*_in_body(series, report, tree, body), gravity_mps2), series)
+
+
+def _turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Turning:
     """Return the integrated rate of an IMU whose mount is known or guessed, with its gyro bias removed if known."""
-    stamps, _, gyro = _in_body(imu, report, tree, body)
+    stamps, _, gyro = _in_body(_series_of(imu, report), report, tree, body)
     t = (stamps - stamps[0]) / NS_PER_S
     return Turning(int(stamps[0]), t, integral(t, gyro[:, 2]))
 
 
-def felt_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Felt:
-    """Return the motion by an IMU whose mount is known or guessed, in the axes of the vessel."""
-    return Felt.of(*_in_body(imu, report, tree, body), 0.0 if report.gravity == "removed" else STANDARD_GRAVITY_MPS2)
-
-
-def _in_body(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> tuple[NDArray[np.int64], Array, Array]:
-    """Return stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the vessel."""
-    series = series_of(imu, report)
+def _in_body(
+    series: ImuSeries, report: ImuReport, tree: StaticTree, body: str
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the vessel, without the gyro bias, if known."""
     known = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
     R = known[1] if known else Rotation.from_euler("xyz", report.mount.rpy_deg, degrees=True).as_matrix()
     unbiased = series.gyro_radps - (report.gyro_bias_radps or (0.0, 0.0, 0.0))
     return series.stamps_ns, series.accel_mps2 @ R.T, unbiased @ R.T
 
 
-def series_of(imu: TopicData, report: ImuReport) -> ImuSeries:
+def _series_of(imu: TopicData, report: ImuReport) -> ImuSeries:
     """Return the usable samples of an IMU that has a report, in SI units, axes of the sensor."""
     keep, _ = samples_of(imu)
     keep = keep[np.isfinite(imu.rows[keep, :6]).all(axis=1)]
@@ -250,7 +260,7 @@ def _against_courses(imu: TopicData, report: ImuReport, courses: Courses | None,
     """Return +1 if the gyro turns like the course of the fixes, -1 if opposite, 0 if unclear."""
     if courses is None or len(courses.stamps_ns) < 20:
         return 0
-    turning, course = turning_of(imu, report, tree, body), np.unwrap(courses.course_rad)
+    turning, course = _turning_of(imu, report, tree, body), np.unwrap(courses.course_rad)
     return course_against_turning(turning, courses.stamps_ns, course)
 
 
@@ -264,7 +274,7 @@ def _turning_axis(
     axes = np.vstack([np.eye(3), -np.eye(3)])
     for axis in axes:
         mount = replace(report.mount, rpy_deg=vec(np.degrees(rpy_from_rotation(_level(axis)))))
-        turning = turning_of(imu, replace(report, mount=mount), tree, body)
+        turning = _turning_of(imu, replace(report, mount=mount), tree, body)
         left.append(left_of_turns(turning, courses.stamps_ns, course))
     return axes[int(np.argmin(left))] if min(left) < _LEFT_OF_TURNS else None
 
