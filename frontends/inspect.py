@@ -6,15 +6,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation
+from graphloc.frames import rotation_from_rpy_deg, rpy_from_rotation
 from graphloc.frontends._assess import (
+    NO_TRACK,
     Courses,
     MeasuredMotion,
+    ReferenceTrack,
     courses_of,
     motion_of_places,
     sane,
@@ -84,15 +84,6 @@ _BELOW_M, _ALIKE = 0.05, 0.9  # antennas in tf, from which its z points down; co
 _FEWEST = 20  # places of a track
 
 
-class _Track(NamedTuple):
-    """Track of the best receiver: stamps (N,), positions (N, 3) m about the first fix, their noise (m, 1 sigma), first fix."""
-
-    stamps_ns: NDArray[np.int64]
-    p_m: Array
-    scatter_m: float
-    first: Vec | None
-
-
 def inspect_bag(bags: Bags | Bag) -> Inspection:
     """Inspect a bag.
 
@@ -111,7 +102,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     odometry = _odometry_reports(bag, gnss, reference)
     velocities = _velocity_reports(bag, reference)
     motions = _motions(bag, reference, odometry, velocities)
-    courses = courses_of(reference.stamps_ns, reference.p_m, reference.scatter_m) if len(reference.stamps_ns) else None
+    courses = courses_of(reference) if len(reference.stamps_ns) else None
     imus, in_body = _in_axes_up(bag, gnss, _imu_reports(bag, motions, courses))
     best = _best_imu(bag, imus)
     compasses = compasses_of(bag, courses, best)
@@ -163,17 +154,17 @@ def _topic_reports(bag: Contents) -> tuple[TopicReport, ...]:
     return (*topics, *sentences)
 
 
-def _best_track(bag: Contents, gnss: Sequence[GnssReport]) -> _Track:
+def _best_track(bag: Contents, gnss: Sequence[GnssReport]) -> ReferenceTrack:
     """Return the track of the first receiver, without frozen fixes; without one, that of poses in a map grid; else an empty one."""
     if not gnss:
         return _grid_track(bag)
     best = gnss[0]
     stamps_ns, p_m, rows = track(bag.aligned[best.topic])
     good = ~frozen_fixes(stamps_ns, rows[:, :2], p_m[:, :2])
-    return _Track(stamps_ns[good], p_m[good], max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first)
+    return ReferenceTrack(stamps_ns[good], p_m[good], max(best.scatter_m[:2]) if best.scatter_m else 1.0, best.first)
 
 
-def _grid_track(bag: Contents) -> _Track:
+def _grid_track(bag: Contents) -> ReferenceTrack:
     """Return the first track in a map grid, about its first position; the grid's north is off by a few degrees."""
     for stream in bag.of_type(*POSE_TYPES):
         keep = sane(stream)
@@ -181,12 +172,12 @@ def _grid_track(bag: Contents) -> _Track:
         good = np.isfinite(p_m).all(axis=1)
         if in_map_grid(stream) and good.sum() > _FEWEST:
             p_m = p_m[good] - p_m[good][0]
-            return _Track(stream.stamps_ns[keep][good], p_m, float(white_noise(p_m)[:2].max()), None)
-    return _Track(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0, None)
+            return ReferenceTrack(stream.stamps_ns[keep][good], p_m, float(white_noise(p_m)[:2].max()))
+    return NO_TRACK
 
 
 def _odometry_reports(
-    bag: Contents, gnss: Sequence[GnssReport], reference: _Track
+    bag: Contents, gnss: Sequence[GnssReport], reference: ReferenceTrack
 ) -> list[tuple[TopicData, OdometryReport]]:
     """Report odometry and poses, by the track and the place of the antenna that it is of."""
     frame = gnss[0].tf_frame if gnss else None
@@ -194,21 +185,18 @@ def _odometry_reports(
     antenna_m = None if mount is None else mount[0]
     found = []
     for stream in bag.of_type(*POSE_TYPES):
-        world = world_of(stream, reference.stamps_ns, reference.p_m, reference.first, antenna_m)
-        found.append((stream, odometry_report(stream, reference.stamps_ns, reference.p_m, world, reference.scatter_m)))
+        world = world_of(stream, reference, antenna_m)
+        found.append((stream, odometry_report(stream, reference, world)))
     return found
 
 
-def _velocity_reports(bag: Contents, reference: _Track) -> list[tuple[TopicData, VelocityReport]]:
-    return [
-        (s, velocity_report(s, reference.stamps_ns, reference.p_m, bag.tf_pose(s), reference.scatter_m))
-        for s in bag.of_type(TWIST, PLAIN_TWIST, VECTOR)
-    ]
+def _velocity_reports(bag: Contents, reference: ReferenceTrack) -> list[tuple[TopicData, VelocityReport]]:
+    return [(s, velocity_report(s, reference, bag.tf_pose(s))) for s in bag.of_type(TWIST, PLAIN_TWIST, VECTOR)]
 
 
 def _motions(
     bag: Contents,
-    reference: _Track,
+    reference: ReferenceTrack,
     odometry: Sequence[tuple[TopicData, OdometryReport]],
     velocities: Sequence[tuple[TopicData, VelocityReport]],
 ) -> list[MeasuredMotion]:
