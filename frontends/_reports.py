@@ -368,6 +368,11 @@ class Inspection:
         compasses = any(c.usable for c in self.compasses)
         return bool(self.imus or self.gnss or compasses or poses or self.velocities or self.lidars or self.cameras)
 
+    @property
+    def in_a_grid(self) -> tuple[OdometryReport, ...]:
+        """Positions in a map grid that stand for fixes, where no receiver tells a latitude."""
+        return () if self.gnss else tuple(item for item in self.odometry if item.grid)
+
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain data for JSON; numbers that are not finite become None."""
         tree = plain(asdict(self))
