@@ -118,7 +118,7 @@ def test_what_a_long_start_found_is_taken(warm: SimulatedRun, monkeypatch: pytes
     """Its walk was said to be taken, and was not."""
     begin_ns = int(warm.truth.stamps_ns[0])
     monkeypatch.setattr(Waiting, "due", lambda _self, newest_ns: newest_ns - begin_ns > 86 * SECOND)
-    monkeypatch.setattr(BiasWalk, "raised", lambda *_: "")
+    monkeypatch.setattr(BiasWalk, "changed", lambda *_: "")
     online = smoother(warm)
     fed = feed(online, warm, arrivals_of(warm))
     (said,) = [event for event in fed.events if "biases change more" in event]
@@ -173,7 +173,7 @@ def filtered(walk: BiasWalk, times: Array, seconds: int, rng: Any) -> list[str]:
         )  # fmt: skip
         links = SimpleNamespace(bias_steps=lambda dt_s, taken=taken: taken * np.sqrt(dt_s))
         lag: Any = SimpleNamespace(newest=newest, problem=SimpleNamespace(links=links, config=config))
-        if line := walk.raised(lag, lambda: SimpleNamespace(sensor="imu")):  # type: ignore[arg-type,return-value]
+        if line := walk.changed(lag, lambda: SimpleNamespace(sensor="imu")):  # type: ignore[arg-type,return-value]
             said.append(line)
             walk.begin()
     return said
@@ -183,6 +183,17 @@ def test_a_walk_as_configured_is_never_raised() -> None:
     """Three hours of six biases."""
     walk = BiasWalk()
     assert not filtered(walk, np.ones(6), 3 * 3600, np.random.default_rng(1))
+
+
+def test_a_walk_that_is_needed_no_more_is_lowered() -> None:
+    """To what the biases go at most, and never below what is configured; those of accelerometers still go that far."""
+    walk, times = BiasWalk(), np.repeat([10.0, 1.0], 3)
+    walk.times[:] = 10.0
+    said = filtered(walk, times, 1800, np.random.default_rng(4))
+    assert said
+    assert all("change less than before: gyro_bias_instability_deg_per_h is 20, " in line for line in said)
+    assert walk.times[0] == 10.0
+    assert 1.0 <= walk.times[1] < 1.5
 
 
 @pytest.mark.parametrize("part", [0, 1])
@@ -212,4 +223,4 @@ def test_where_the_heading_is_hardly_known_nothing_is_told() -> None:
             bias=gtsam.imuBias.ConstantBias(np.full(3, float(k)), np.zeros(3)), bias_cov=np.eye(6) * 1e-8,
         )  # fmt: skip
         lag: Any = SimpleNamespace(newest=newest, problem=SimpleNamespace(links=links))
-        assert not walk.raised(lag, lambda: pytest.fail("asked for samples"))
+        assert not walk.changed(lag, lambda: pytest.fail("asked for samples"))

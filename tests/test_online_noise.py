@@ -51,7 +51,7 @@ def said(likely: Any, *at_s: float, lag_s: float = 10.0) -> list[str]:
             fresh=True, lag_s=lag_s, newest=steady(SECOND + round(at * SECOND)), misfit=lambda: 1.0,
             problem=SimpleNamespace(config=config, links=links), likelihoods=likelihoods,
         )  # fmt: skip
-        lines.append(noise.raised(lag, scattering))
+        lines.append(noise.changed(lag, scattering))
     return lines
 
 
@@ -91,5 +91,5 @@ def test_biases_tell_no_walk_while_the_heading_is_doubtful(*, doubtful: bool) ->
             problem=problem,
             likelihoods=lambda _: np.zeros(4),
         )
-        lines.append(noise.raised(lag, scattering, heading_doubtful=doubtful))
+        lines.append(noise.changed(lag, scattering, heading_doubtful=doubtful))
     assert any("gyro_bias_instability" in line for line in lines) is not doubtful

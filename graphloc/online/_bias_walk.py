@@ -1,25 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Walk of the IMU's biases: raised where they go farther than they were known and may have walked since (offline: `solve/bias_walk.py`)."""
+"""Walk of the IMU's biases: raised where they go farther than they were known and may have walked since (offline: `solve/bias_walk.py`).
+
+Lowered again where they have gone clearly less far for minutes: an IMU that warms up is warm some time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtr, chdtri
 
+from graphloc.graph import InertialLink
 from graphloc.measurements import ImuSeries
 from graphloc.online._lag import Lag
 from graphloc.solve.bias_walk import KEYS, MOST_TIMES, KnownBias, too_steady, went_too_far
 
 _EVERY_S = 10.0
-_KEPT = 6  # of these: a minute; a bias that creeps shows after the longest
+_RAISED_BY = 6  # of these: a minute; a bias that creeps shows after the longest
+_LOWERED_BY = 90  # of these: a quarter of an hour
+_CLEAR = 4.0  # variances of a bias that its walk must exceed: else how it goes is what the filter makes of noise
+_TOO_LITTLE = 1e-5  # probability; lowered too far by chance it is raised again
+_AT_MOST = 0.95  # confidence that the bias walks no more than what is taken then
+_LEAST_LESS = 0.8  # of the walk; a smaller change is not worth a window that is built anew
 # 1 sigma: from which the heading turns the biases of accelerometers with it, by more than their covariance tells.
 _HEADING_RAD = 0.1
 
 
 class BiasWalk:
-    """Factors on the configured walk of the biases; they only grow.
+    """Factors on the configured walk of the biases, at least 1.
 
     Attributes:
         times: (2,) of accelerometers and of gyroscopes.
@@ -38,24 +48,25 @@ class BiasWalk:
         """Return the configuration of the IMU with its walk raised."""
         return sensor.scaled(dict(zip(KEYS, self.times.tolist(), strict=True)))
 
-    def raised(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
-        """Raise the walk of accelerometers or gyroscopes where that is needed; return a line on that, or empty."""
-        newest, known = lag.newest, self._known
+    def changed(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
+        """Raise the walk of accelerometers or gyroscopes where that is needed, lower it where it is no more; return a line on that, or empty."""
+        newest = lag.newest
         R = newest.pose.rotation().matrix()
         if (R @ newest.pose_cov[:3, :3] @ R.T)[2, 2] > _HEADING_RAD**2:
             self.begin()
             return ""
         if self._since_ns is None:
             self._since_ns = newest.stamp_ns
-        if newest.stamp_ns - (known[-1].stamp_ns if known else self._since_ns) >= _EVERY_S * 1e9:
-            now = KnownBias(newest.stamp_ns, newest.bias.vector(), np.diagonal(newest.bias_cov))
-            self._known = [*known[-_KEPT:], now]
-            return self._told(lag, now, samples) if known else ""
-        return ""
+        if newest.stamp_ns - (self._known[-1].stamp_ns if self._known else self._since_ns) < _EVERY_S * 1e9:
+            return ""
+        now = KnownBias(newest.stamp_ns, newest.bias.vector(), np.diagonal(newest.bias_cov))
+        self._known = [*self._known[-_LOWERED_BY:], now]
+        return self._raised(lag, samples) or self._lowered(lag, samples)
 
-    def _told(self, lag: Lag, now: KnownBias, samples: Callable[[], ImuSeries]) -> str:
-        """Raise the walk where how far the biases have gone since tells it, and return a line on that; or empty."""
-        found = went_too_far(self._known[:-1], now, lag.problem.links, lasting=True)
+    def _raised(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
+        """Raise the walk where how far the biases have gone tells it, and return a line on that; or empty."""
+        *before, now = self._known[-_RAISED_BY - 1 :]
+        found = went_too_far(before, now, lag.problem.links, lasting=True)
         if found is None:
             return ""
         k, times = found
@@ -65,3 +76,43 @@ class BiasWalk:
         name = samples().sensor
         imu = lag.problem.config.sensors[name]
         return too_steady(name, imu, self.of(imu))
+
+    def _lowered(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
+        """Lower a raised walk to what the biases have gone at most, and return a line on that; or empty."""
+        for k in np.flatnonzero(self.times > 1.0).tolist():
+            share = walks_less(self._known, lag.problem.links, k)
+            if share is None:
+                continue
+            self.times[k] = max(self.times[k] * share, 1.0)
+            name = samples().sensor
+            imu = lag.problem.config.sensors[name]
+            return f"{name}: its biases change less than before: {KEYS[k]} is {getattr(imu, KEYS[k]):.3g}, {getattr(self.of(imu), KEYS[k]):.3g} is taken"
+        return ""
+
+
+def walks_less(known: Sequence[KnownBias], links: InertialLink, k: int) -> float | None:
+    """Return what share of the walk explains, at most, how little biases have gone of late (0: of accelerometers, 1: of gyroscopes); None: none is told.
+
+    Args:
+        known: of one estimate, by stamp.
+    """
+    steps = sorted((step for axis in range(3 * k, 3 * k + 3) for step in _steps(known, links, axis)), reverse=True)
+    squares = np.cumsum([square for _, square in steps])
+    freedom = np.arange(1, len(steps) + 1)
+    likely = chdtr(freedom, squares)
+    if not (likely < _TOO_LITTLE).any():
+        return None
+    n = int(np.argmin(likely))
+    share = float(np.sqrt(squares[n] / chdtri(freedom[n], _AT_MOST)))
+    return share if share < _LEAST_LESS else None
+
+
+def _steps(known: Sequence[KnownBias], links: InertialLink, axis: int) -> Iterator[tuple[int, float]]:
+    """Yield, from the last, by how much one bias went in steps that its walk rules: since when, and the square by what it should."""
+    later = known[-1]
+    for then in reversed(known[:-1]):
+        walk = links.bias_steps((later.stamp_ns - then.stamp_ns) * 1e-9)[axis] ** 2
+        if walk > _CLEAR * max(then.variance[axis], later.variance[axis]):
+            expected = then.variance[axis] + walk - later.variance[axis]
+            yield then.stamp_ns, float((later.bias[axis] - then.bias[axis]) ** 2 / expected)
+            later = then

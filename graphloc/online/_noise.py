@@ -20,14 +20,14 @@ _SURE = 8.0  # log-likelihood that it must gain
 
 
 class ImuNoise:
-    """Factors on the configured noise densities; they only grow.
+    """Factors on the configured noise densities; but for the walk of the biases they only grow.
 
     Args:
         adapt: whether they may grow (`adapt_noise`).
 
     Attributes:
         scale: of both, at least 1. gyro, accel: beside it, of each. walk: those on the walk of the biases.
-        misled: how many times larger the covariance of an estimate is to be that had less of this walk; 1: `raised` raised none.
+        misled: how many times larger the covariance of an estimate is to be that had less of this walk; 1: `changed` raised none.
     """
 
     def __init__(self, *, adapt: bool) -> None:
@@ -53,8 +53,8 @@ class ImuNoise:
         """Return the configuration of the IMU with its noise raised but for the scale."""
         return noisier_imu(self.walk.of(sensor), self.gyro, self.accel)
 
-    def raised(self, lag: Lag, samples: Callable[[], ImuSeries], *, heading_doubtful: bool = False) -> str:
-        """Raise the noise where that is needed; return a line on that, or empty.
+    def changed(self, lag: Lag, samples: Callable[[], ImuSeries], *, heading_doubtful: bool = False) -> str:
+        """Raise the noise where that is needed, or lower the walk again; return a line on that, or empty.
 
         Args:
             samples: gives those of the window. heading_doubtful: the heading may be wrong: that bends the biases as well.
@@ -65,9 +65,9 @@ class ImuNoise:
         self.misled, before = 1.0, self.walk.times.copy()
         if heading_doubtful:
             self.walk.begin()
-        said = self.walk.raised(lag, samples) or self._contradicted(lag) or self._too_quiet(lag, samples)
+        said = self.walk.changed(lag, samples) or self._contradicted(lag) or self._too_quiet(lag, samples)
         if said:
-            self.misled = float((self.walk.times / before).max())
+            self.misled = max(1.0, float((self.walk.times / before).max()))
         return said
 
     def _contradicted(self, lag: Lag) -> str:

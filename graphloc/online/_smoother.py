@@ -307,7 +307,7 @@ class OnlineSmoother:
                 self._rebuild(noise)
                 return self._estimate()
             doubtful = persistent.heading_check.doubtful
-            if noise := persistent.noise.raised(tracking.lag, tracking.samples, heading_doubtful=doubtful):
+            if noise := persistent.noise.changed(tracking.lag, tracking.samples, heading_doubtful=doubtful):
                 self._rebuild(noise, persistent.noise.misled)
                 return self._estimate()
             return tracking.estimate()
