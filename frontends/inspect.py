@@ -12,7 +12,6 @@ import numpy as np
 from graphloc.frames import rotation_from_rpy_deg, rpy_from_rotation
 from graphloc.frontends._assess import (
     NO_TRACK,
-    Courses,
     MeasuredMotion,
     ReferenceTrack,
     courses_of,
@@ -22,7 +21,7 @@ from graphloc.frontends._assess import (
     track,
     vec,
 )
-from graphloc.frontends._assess_imu import Inertial, imu_report, inertial_of, turned_as_its_heading
+from graphloc.frontends._assess_imu import ImuEvidence, Inertial, imu_report, inertial_of, turned_as_its_heading
 from graphloc.frontends._assess_receivers import apart_warning
 from graphloc.frontends._assess_velocity import motion_of_poses, motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of
@@ -103,12 +102,13 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     velocities = _velocity_reports(bag, reference)
     motions = _motions(bag, reference, odometry, velocities)
     courses = courses_of(reference) if len(reference.stamps_ns) else None
-    imus, in_body = _in_axes_up(bag, gnss, _imu_reports(bag, motions, courses))
-    best = _best_imu(bag, imus)
+    evidence = ImuEvidence(motions, courses, bag.tree)
+    imus, in_body = _in_axes_up(bag, gnss, _imu_reports(bag, evidence))
+    best = _best_imu(bag, imus, evidence)
     compasses = compasses_of(bag, courses, best)
     taken, imus = imus, [turned_as_its_heading(imu, compasses) for imu in imus]
     if imus and imus[0] is not taken[0]:
-        best = _best_imu(bag, imus)
+        best = _best_imu(bag, imus, evidence)
     late = {motion.source: motion_time_offset(best.felt, motion) for motion in motions} if best else {}
     timed = [timed_fixes(report, late, motions, velocities, bag.streams) for report in gnss]
     together = {receiver_of(report.topic): report.late_s for report in timed if report.late_s}
@@ -210,10 +210,9 @@ def _motions(
     return motions + [motion for motion in (in_grid, *posed) if motion]
 
 
-def _imu_reports(bag: Contents, motions: Sequence[MeasuredMotion], courses: Courses | None) -> list[ImuReport]:
+def _imu_reports(bag: Contents, evidence: ImuEvidence) -> list[ImuReport]:
     """Report the IMUs: whole ones with gravity in them first, the least noisy ones first; of those about as noisy, one whose mount tf or the motion tells."""
-    body = bag.tree.body()
-    imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, motions, courses, bag.tree, body))]
+    imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, evidence))]
 
     def kind(imu: ImuReport) -> tuple[bool, bool]:
         return bool(imu.missing), imu.gravity == "removed"
@@ -227,8 +226,8 @@ def _imu_reports(bag: Contents, motions: Sequence[MeasuredMotion], courses: Cour
     return sorted(imus, key=key)
 
 
-def _best_imu(bag: Contents, imus: Sequence[ImuReport]) -> Inertial | None:
-    return inertial_of(bag.aligned[imus[0].topic], imus[0], bag.tree, bag.tree.body()) if imus else None
+def _best_imu(bag: Contents, imus: Sequence[ImuReport], evidence: ImuEvidence) -> Inertial | None:
+    return inertial_of(bag.aligned[imus[0].topic], imus[0], evidence) if imus else None
 
 
 def _in_axes_up(
