@@ -23,6 +23,7 @@ from graphloc.frontends._clock import (
     usual_latency_s,
     without_leaps,
 )
+from graphloc.frontends._reports import bare_topic
 from graphloc.frontends._streams import Sentences, TopicData, read_streams
 from graphloc.frontends._tf import Pose, StaticTree
 from graphloc.frontends.aerial.cloud import CLOUDS
@@ -136,7 +137,7 @@ def _without_leaps(streams: list[TopicData]) -> tuple[list[TopicData], list[str]
     latency_s = usual_latency_s(imu.stamps_ns, imu.logs_ns)
     right, lines = [], dict[str, str]()
     for stream in streams:
-        topic = stream.topic.partition(" ")[0]
+        topic = bare_topic(stream.topic)
         if not stream.recorded:
             stamps_ns, said = without_leaps(stream.stamps_ns, stream.logs_ns, latency_s, topic)
             if said:
@@ -160,7 +161,7 @@ def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
     stamped = [s for s in streams if len(s) >= FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED]
     steps: dict[str, ClockStep | None] = {}
     for stream in stamped:  # of what comes on one topic, some may come on one side only
-        topic = stream.topic.partition(" ")[0]
+        topic = bare_topic(stream.topic)
         steps[topic] = steps.get(topic) or step(stream.stamps_ns, stream.logs_ns)
     found = {topic: at for topic, at in steps.items() if at is not None}
     sizes = [at.by_s for at in found.values()]
@@ -171,7 +172,7 @@ def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
 
 def _as_mostly_set(stream: TopicData, steps: Mapping[str, ClockStep]) -> TopicData:
     """Return the stream with the stamps of before, or after, its clock was set moved to where most are: else it contradicts itself."""
-    at = steps.get(stream.topic.partition(" ")[0])
+    at = steps.get(bare_topic(stream.topic))
     if at is None or stream.recorded:
         return stream
     after = stream.logs_ns >= at.at_ns

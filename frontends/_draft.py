@@ -14,7 +14,15 @@ from graphloc.frontends._draft_lines import FILTERED, mount_line, numbered, topi
 from graphloc.frontends._draft_receivers import receiver_blocks
 from graphloc.frontends._draft_scanners import scanner_blocks
 from graphloc.frontends._draft_velocities import velocity_blocks, wheels_block
-from graphloc.frontends._reports import CompassReport, ImuReport, Inspection, MountGuess, OdometryReport, filtered
+from graphloc.frontends._reports import (
+    CompassReport,
+    ImuReport,
+    Inspection,
+    MountGuess,
+    OdometryReport,
+    bare_topic,
+    filtered,
+)
 from graphloc.frontends._turns import WANDERS_DEG
 from graphloc.frontends.decode import IMU, POINT
 
@@ -65,7 +73,7 @@ def _compass_blocks(compasses: Sequence[CompassReport]) -> Iterator[list[str]]:
     usable = (c for c in compasses if c.usable)
     seen: set[str] = set()
     for k, compass in enumerate(sorted(usable, key=lambda c: (filtered(c.topic), c.topic.endswith(_MAGNETIC)))):
-        name = compass.topic.partition(" ")[0]
+        name = bare_topic(compass.topic)
         off = "another heading of the same topic is used, a true one before a magnetic one" if name in seen else ""
         if k and filtered(compass.topic):
             off = "by its name, or its messages, a filter's output, which the other heading may be in already"

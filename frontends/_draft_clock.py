@@ -23,6 +23,7 @@ from graphloc.frontends._reports import (
     MountedTopic,
     TopicReport,
     VelocityReport,
+    bare_topic,
 )
 from graphloc.frontends.decode import UNSTAMPED
 from graphloc.time import GPS_AHEAD_S
@@ -51,7 +52,7 @@ def with_clock(block: list[str], inspection: Inspection) -> list[str]:
 
 def _by_topic(inspection: Inspection) -> dict[str, TopicReport]:
     """Return the reports by topic, the last of those that share it: of NMEA a report is of a sentence."""
-    return {t.topic.partition(" ")[0]: t for t in inspection.topics}
+    return {bare_topic(t.topic): t for t in inspection.topics}
 
 
 def _value(block: list[str], key: str) -> str:
@@ -120,7 +121,7 @@ def _sigma_line(own: TopicReport, told: Sequence[_Told], hinted: tuple[float, fl
 
 def _hinted(topic: str, inspection: Inspection) -> tuple[float, float] | None:
     """Return what the IMU hints at that the stamps of a topic of fixes are late by, s, and 1 sigma."""
-    return next((r.hinted_s for r in inspection.gnss if r.topic.partition(" ")[0] == topic and r.hinted_s), None)
+    return next((r.hinted_s for r in inspection.gnss if bare_topic(r.topic) == topic and r.hinted_s), None)
 
 
 def _by_recording_times(kind: str, behind_s: float, clock: str) -> list[_Told]:
@@ -141,7 +142,7 @@ def _by_motion(kind: str, topic: str, inspection: Inspection) -> list[_Told]:
         "compass": inspection.compasses,
     }
     for report in reports.get(kind, ()):
-        if report.topic.partition(" ")[0] == topic and report.late_s:
+        if bare_topic(report.topic) == topic and report.late_s:
             late_s, sigma_s = report.late_s
             why = f"{_fits(report)} {late_s:+.2f} +- {sigma_s:.2f} s from its stamps"
             return [_Told(late_s, max(sigma_s, _STAMPED_LATE_S), why)]
@@ -154,7 +155,7 @@ def _fits(report: GnssReport | VelocityReport | CompassReport) -> str:
     if isinstance(report, CompassReport):
         return "its turns fit the gyro's"
     by = report.late_by if isinstance(report, GnssReport) else ""
-    other = by if by.partition(" ")[0] != report.topic.partition(" ")[0] else ""
+    other = by if bare_topic(by) != bare_topic(report.topic) else ""
     whose = f"the motion of {other}, taken for the same receiver's," if other else "its motion"
     return f"what the IMU feels fits {whose}"
 
@@ -164,7 +165,7 @@ def _by_sentences(kind: str, topic: str, inspection: Inspection) -> list[_Told]:
 
     A computer's clock that nothing sets may be as far off by chance: what the IMU feels is believed rather, even a hint.
     """
-    told = [t.after_s for t in inspection.topics if t.topic.partition(" ")[0] == topic and t.after_s]
+    told = [t.after_s for t in inspection.topics if bare_topic(t.topic) == topic and t.after_s]
     if kind not in _ESTIMATED or not told:
         return []
     least, after, most = min(told, key=lambda points: points[2] - points[0])
@@ -183,7 +184,7 @@ def clock_lines(inspection: Inspection) -> list[str]:
     named = [imu.topic for imu in inspection.imus] + [gnss.topic for gnss in inspection.gnss]
     named += [twist.topic for twist in inspection.velocities] + [compass.topic for compass in inspection.compasses]
     lines = []
-    for topic in dict.fromkeys(name.partition(" ")[0] for name in named):
+    for topic in dict.fromkeys(bare_topic(name) for name in named):
         behind, clock = _behind(topic, topics, inspection) or (0.0, "")
         if abs(behind) > EPOCH_LIMIT_S:
             way = "behind" if behind > 0.0 else "ahead of"

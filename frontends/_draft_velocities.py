@@ -16,6 +16,7 @@ from graphloc.frontends._reports import (
     Inspection,
     OdometryReport,
     VelocityReport,
+    bare_topic,
     filtered,
     through_water,
 )
@@ -103,7 +104,7 @@ def _of_antenna(twist: VelocityReport, gnss: GnssReport | None) -> str | None:
     """
     if gnss is None or gnss.tf_frame or twist.tf_frame or filtered(gnss.topic) != filtered(twist.topic):
         return None
-    if gnss.topic.partition(" ")[0] == twist.topic.partition(" ")[0]:
+    if bare_topic(gnss.topic) == bare_topic(twist.topic):
         return "of the same topic"
     told = twist.frame_id and twist.frame_id == gnss.frame_id and twist.frame_id.strip("/") not in WORLD_NAMES
     return f"both have the frame '{twist.frame_id}'" if told else None

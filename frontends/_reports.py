@@ -32,6 +32,11 @@ FILTER = " (of a filter)"
 EAST_AXES, NORTH_AXES, BODY_AXES = "east, north, up", "north, east, down", "forward, left, up (body)"
 
 
+def bare_topic(name: str) -> str:
+    """Return the topic of a stream by its name, without the sentence of NMEA, or the kind of message, that the stream is of."""
+    return name.partition(" ")[0]
+
+
 def two_antennas(topic: str) -> bool:
     """Return whether a heading is one of GNSS, by the name of its topic or its sentence."""
     return bool(_TWO_ANTENNAS.search(topic)) and not filtered(topic)

@@ -12,7 +12,7 @@ from graphloc.frontends._assess import sane
 from graphloc.frontends._assess_imu import samples_of
 from graphloc.frontends._contents import Contents
 from graphloc.frontends._reader import either
-from graphloc.frontends._reports import GnssReport, ImuReport, OdometryReport
+from graphloc.frontends._reports import GnssReport, ImuReport, OdometryReport, bare_topic
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import FIX_TYPES, IMU, NMEA, NUMBERS
 from graphloc.frontends.source import TopicSummary
@@ -51,7 +51,7 @@ def lacking(
 def _of_other_types(bag: Contents) -> list[str]:
     """Return a line on the topics of types that are neither read here nor known for something else."""
     read = {
-        *(name.partition(" ")[0] for name in bag.streams),
+        *(bare_topic(name) for name in bag.streams),
         *bag.lidars,
         *bag.cameras,
     }  # of NMEA a stream is a sentence
