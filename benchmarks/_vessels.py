@@ -195,7 +195,7 @@ def _velocities(yard: _Yard, sigma_mps: float = 0.08) -> None:
     v = v + yard.rng.normal(0.0, sigma_mps, v.shape)
     cov = sigma_mps**2 * np.eye(3)
     yard.measurements += [
-        GnssVelocity(stamp_ns=int(n), sensor="velocity", seq=0, v_world_mps=x, cov_m2ps2=cov)
+        GnssVelocity(stamp_ns=int(n), sensor="velocity", seq=0, v_enu_mps=x, cov_m2ps2=cov)
         for n, x in zip(stamps(t), v, strict=True)
     ]
 

@@ -2,8 +2,9 @@
 """Compass heading with mount offset, magnetic deviation, and a slow error.
 
     z = y + A + B sin(h) + C cos(h) + D sin(2h) + E cos(2h) + e + w,   w ~ N(0, s^2)
-    y = yaw(R_world_body R_body_sensor),   h = 90 deg - y: heading of the sensor's own x axis, clockwise from north
+    y = yaw(R_world_body R_body_sensor) - c,   h = 90 deg - y: heading of the sensor's own x axis, clockwise from north
 
+c: convergence, by which north where the vessel is lies counter-clockwise of the datum's (`Datum.convergence_rad`), by the estimate.
 A: mount offset. B to E: deviation by the vessel's iron, as in navigation (A. Smith's coefficients; east is positive), constants
 of the run. e: wander, a first-order Gauss-Markov process, of what passes: a crane, a quay of sheet piles, the compass's filter.
 Modelled as noise instead, deviation or wander of some degrees bends the heading by half of it, since ten readings per second
@@ -62,6 +63,11 @@ def _axis(at: Attachment) -> tuple[Array, Array, Array]:
     return R, x_body, R @ x_body
 
 
+def _yaw(at: Attachment, x_world: Array) -> float:
+    """Return y, rad; `x_world`: of the sensor (3,)."""
+    return math.atan2(x_world[1], x_world[0]) - float(at.datum.convergence_rad(at.T_world_body.translation()))
+
+
 def _read(at: Attachment, config: CompassConfig, yaw: float) -> tuple[float, Array]:
     """Return the predicted reading, rad, and its derivative by the slow state (k,)."""
     if at.slow_value is None:
@@ -83,7 +89,7 @@ def _slope(at: Attachment, config: CompassConfig, yaw: float) -> float:
 def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple[Residual, ...]:
     """Return predicted - measured (1,), rad."""
     R, x_body, x = _axis(at)
-    yaw = math.atan2(x[1], x[0])
+    yaw = _yaw(at, x)
     read, terms = _read(at, config, yaw)
     raw = np.array([math.remainder(read - m.yaw_rad, math.tau)])
     sigma = max(m.sigma_rad, _FLOOR_RAD)
@@ -120,7 +126,7 @@ def slow(config: CompassConfig) -> SlowProcess | None:
 def ideal(at: Attachment, config: CompassConfig) -> CompassHeading:
     """Return the noise-free heading at the attachment's state."""
     _, _, x = _axis(at)
-    yaw = float(wrap_angle(np.array(_read(at, config, math.atan2(x[1], x[0]))[0])))
+    yaw = float(wrap_angle(np.array(_read(at, config, _yaw(at, x))[0])))
     return CompassHeading(stamp_ns=0, sensor="compass", seq=0, yaw_rad=yaw, sigma_rad=np.radians(config.sigma_deg))
 
 

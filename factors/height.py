@@ -18,19 +18,18 @@ import numpy as np
 
 from graphloc.config import HeightConfig
 from graphloc.factors._noise import robust
-from graphloc.frames import Array, Datum, skew
+from graphloc.frames import EARTH_M, Array, Datum, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import HeightPrior
 from graphloc.time import duration_ns
 
 _WIDE_M = 1e3
-_EARTH_M = 6_371_000.0
 _TIDE_S = 6.0 * 3600.0
 
 
 def _fall_m(p_world_m: Array) -> float:
     """Return how far the ellipsoid lies below the datum's tangent plane."""
-    return float(p_world_m[0] ** 2 + p_world_m[1] ** 2) / (2.0 * _EARTH_M)
+    return float(p_world_m[0] ** 2 + p_world_m[1] ** 2) / (2.0 * EARTH_M)
 
 
 def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Residual, ...]:

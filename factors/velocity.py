@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """GNSS velocity of the antenna.
 
-    z = v + dv + R (omega x (l + o)) + a tau + d + w,   w ~ N(0, C + W),   d: first-order Gauss-Markov per axis
+    z = L' (v + dv + R (omega x (l + o)) + a tau) + d + w,   w ~ N(0, C + W),   d: first-order Gauss-Markov per axis
     a = R (f + alpha x (l + o) + omega x (omega x (l + o))) + g
 
-v: velocity of body in world at the state; dv: its change until the measurement, by the IMU; omega: body rate from the gyroscope,
+L: from east, north, up where the vessel is to world (`Datum.local_axes`); v: velocity of body in world at the state; dv: its change until the measurement, by the IMU; omega: body rate from the gyroscope,
 bias removed; l: antenna in body; o: how far from there it sits, a constant of the run, where that is not known; a: acceleration of
 the antenna, by the specific force f and the change alpha of the body rate; tau: how much later than stamped it was measured
 (negative: stamped late), a constant of the run, where that is not known; W: what d walks between its nodes (`Attachment.slow_walk`).
-The slow state holds n = -d, as that of `gnss`. d z / d v = I,
-d z / d theta = -R [omega x (l + o) + (f + ...) tau]_x. The lever-arm term carries information: in waves it shows the heading. With R fixed at the
+The slow state holds n = -d, as that of `gnss`. d z / d v = L',
+d z / d theta = -L' R [omega x (l + o) + (f + ...) tau]_x. The lever-arm term carries information: in waves it shows the heading. With R fixed at the
 estimate in it, passes converged slowly (not after 6). dv and omega are taken from the estimate at every pass; dv within half a period
 of the states turns by 9 mm/s for 1 deg of attitude. Not handled: of tau what a changes by in that time.
 """
@@ -26,12 +26,18 @@ from graphloc.graph import Attachment, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import GnssVelocity
 
 
+def _to_local(at: Attachment) -> Array:
+    """L' (3, 3)."""
+    return at.datum.local_axes(at.T_world_body.translation()).T
+
+
 def _predicted_mps(at: Attachment, config: VelocityConfig) -> Array:
-    """The velocity (3,) without noise, in world."""
+    """The velocity (3,) without noise: east, north, up."""
     late, off = late_and_off(at, config)
     v = at.sensor_velocity_mps(off)
     if late:
         v = v + at.sensor_acceleration_mps2(off) * late
+    v = _to_local(at) @ v
     return v if at.slow_value is None else v - at.slow_value
 
 
@@ -39,7 +45,7 @@ def _attitude_jacobian(at: Attachment, config: VelocityConfig) -> Array:
     """Return the derivative (3, 6) of what R turns by the body tangent (theta, rho)."""
     late, off = late_and_off(at, config)
     turned = at.swing_mps(off) + (at.pushed_mps2(off) * late if late else 0.0)
-    return np.hstack([-at.T_world_body.rotation().matrix() @ skew(turned), np.zeros((3, 3))])
+    return np.hstack([-_to_local(at) @ at.T_world_body.rotation().matrix() @ skew(turned), np.zeros((3, 3))])
 
 
 def _by_constants(at: Attachment, config: VelocityConfig) -> tuple[Array, ...]:
@@ -53,16 +59,16 @@ def _by_constants(at: Attachment, config: VelocityConfig) -> tuple[Array, ...]:
         if late and at.felt is not None:
             swing = swing + late * (skew(at.felt.spin_radps2) + swing @ swing)
         columns.append(at.T_world_body.rotation().matrix() @ swing @ at.T_state_sensor.rotation().matrix())
-    return (np.hstack(columns),) if columns else ()
+    return (_to_local(at) @ np.hstack(columns),) if columns else ()
 
 
 def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[Residual, ...]:
-    """Return predicted - measured (3,), m/s, in world."""
+    """Return predicted - measured (3,), m/s: east, north, up."""
     plain = Residual(
-        raw=_predicted_mps(at, config) - m.v_world_mps,
+        raw=_predicted_mps(at, config) - m.v_enu_mps,
         cov=with_floors(m.cov_m2ps2, config.min_sigma_mps**2),
         jacobian=lambda: _attitude_jacobian(at, config),
-        velocity_jacobian=lambda: np.eye(3),
+        velocity_jacobian=lambda: _to_local(at),
         slow_jacobian=lambda: -np.eye(3),
         constant_jacobians=lambda: _by_constants(at, config),
         prior=1.0,
@@ -92,14 +98,14 @@ def ideal(at: Attachment, config: VelocityConfig) -> GnssVelocity:
         stamp_ns=0,
         sensor="gnss_velocity",
         seq=0,
-        v_world_mps=_predicted_mps(at, config),
+        v_enu_mps=_predicted_mps(at, config),
         cov_m2ps2=np.eye(3) * 0.01,
     )
 
 
 def hint(m: GnssVelocity, mount_yaw_rad: float, datum: Datum) -> Hint:
     """Return the velocity of the antenna."""
-    return Hint(v_world_mps=m.v_world_mps)
+    return Hint(v_world_mps=m.v_enu_mps)
 
 
 ROW = Sensor(

@@ -47,7 +47,7 @@ def _apart_mps(motion: MeasuredMotion, velocities: Sequence[GnssVelocity]) -> tu
     """Return by how much velocities differ from chords of a way, m/s, median, as they are and exchanged; None of a craft that hardly moves."""
     assert motion.way_m is not None
     t = (stamps_of(velocities) - motion.origin_ns) / NS_PER_S
-    v = np.array([m.v_world_mps[:2] for m in velocities])
+    v = np.array([m.v_enu_mps[:2] for m in velocities])
     inside = (t > motion.t_s[0] + _HALF_S) & (t < motion.t_s[-1] - _HALF_S)
     t, v = t[inside], v[inside]
     way = np.column_stack([motion.way_m.real, motion.way_m.imag])

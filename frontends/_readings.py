@@ -297,7 +297,7 @@ def _content(value: Decoded) -> object:
         case CompassHeading():
             return value.yaw_rad
         case GnssVelocity():
-            return tuple(value.v_world_mps)
+            return tuple(value.v_enu_mps)
         case BodyVelocity():
             return tuple(value.value)
         case PoseFix():

@@ -429,7 +429,7 @@ def _moving(
         return trouble
     default = np.full(3, config.default_sigma_mps**2)
     return GnssVelocity(
-        stamp_ns=stamp_ns, sensor=sensor, seq=seq, v_world_mps=value, cov_m2ps2=usable_covariance(cov, default)
+        stamp_ns=stamp_ns, sensor=sensor, seq=seq, v_enu_mps=value, cov_m2ps2=usable_covariance(cov, default)
     )
 
 

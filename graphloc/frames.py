@@ -18,6 +18,9 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
+EARTH_M = 6_371_000.0
+"""Radius of the sphere by which the ellipsoid falls and turns away from the datum's tangent plane: 0.3 % of that."""
+
 
 class Frame(NamedTuple):
     """A frame: its name, the direction of its axes, and its origin."""
@@ -84,6 +87,22 @@ class Datum:
         p = np.atleast_2d(p_world_m)
         lon, lat, h = self._pipeline().transform(p[:, 0], p[:, 1], p[:, 2], direction="INVERSE")
         return np.column_stack([lat, lon, h])
+
+    def convergence_rad(self, p_world_m: Array) -> Array:
+        """Return by how much true north at places (..., 3) in world lies counter-clockwise of north at the origin: 0.2 deg at 10 km east in latitude 60."""
+        p = np.asarray(p_world_m, dtype=float)
+        latitude_rad = np.radians(self.origin.latitude_deg) + p[..., 1] / EARTH_M
+        return np.asarray(p[..., 0] * np.tan(latitude_rad) / EARTH_M)
+
+    def local_axes(self, p_world_m: Array) -> Array:
+        """Return R (3, 3) from east, north, up of the ellipsoid at a place in world (3,) to the axes of world."""
+        east, north = np.asarray(p_world_m, dtype=float)[:2] / EARTH_M
+        turn = skew(np.array([-north, east, float(self.convergence_rad(p_world_m))]))
+        return np.asarray(np.eye(3) + turn + 0.5 * turn @ turn)
+
+    def true_heading_deg(self, yaw_rad: Array | float, p_world_m: Array) -> Array:
+        """Return headings (...) from true north at the places (..., 3), clockwise in [0, 360) deg, of yaws (...) in world."""
+        return heading_deg_from_yaw(np.asarray(yaw_rad) - self.convergence_rad(p_world_m))
 
 
 def skew(v: Array) -> Array:

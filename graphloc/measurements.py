@@ -84,7 +84,7 @@ def world_from_fixes(fixes: Sequence[GnssPosition], datum: Datum) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CompassHeading(Measurement):
-    """Yaw of the sensor's x axis in world: rad, from east, counter-clockwise; with its sigma."""
+    """Yaw of the sensor's x axis: rad, from (true) east where the vessel is, counter-clockwise; with its sigma."""
 
     yaw_rad: float
     sigma_rad: float
@@ -96,13 +96,13 @@ class CompassHeading(Measurement):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GnssVelocity(Measurement):
-    """Velocity of the antenna, (3,) m/s in world (ENU), with covariance (3, 3) in m^2/s^2."""
+    """Velocity of the antenna, (3,) m/s: east, north, up where it is; with covariance (3, 3) in m^2/s^2."""
 
-    v_world_mps: Array
+    v_enu_mps: Array
     cov_m2ps2: Array
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "v_world_mps", _frozen(self.v_world_mps, (3,), "v_world_mps"))
+        object.__setattr__(self, "v_enu_mps", _frozen(self.v_enu_mps, (3,), "v_enu_mps"))
         object.__setattr__(self, "cov_m2ps2", _frozen_covariance(self.cov_m2ps2, 3, "cov_m2ps2"))
 
 

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.berths import BerthTrack
 from graphloc.chi2 import SIGMAS_95
 from graphloc.config import VesselConfig, effective
-from graphloc.frames import Array, heading_deg_from_yaw
+from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.plain import plain
 from graphloc.recording import Span
@@ -99,7 +99,8 @@ def _solution_rows(solution: Solution, picked: Array) -> Iterator[list[object]]:
     assert track.cov is not None
     assert track.v_world_mps is not None
     geodetic = solution.datum.geodetic_from_enu(track.p_world_m[picked])
-    rpy, heading = np.degrees(track.rpy_rad[picked]), heading_deg_from_yaw(track.yaw_rad[picked])
+    rpy = np.degrees(track.rpy_rad[picked])
+    heading = solution.datum.true_heading_deg(track.yaw_rad[picked], track.p_world_m[picked])
     bound = bounds_95(track.cov[picked])
     for i, k in enumerate(picked):
         stamp = int(track.stamps_ns[k])

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.config import VesselConfig, load_config
 from graphloc.estimate import Estimate, Event
 from graphloc.factors import INERTIAL, KINDS, SENSORS
-from graphloc.frames import Array, Datum, heading_deg_from_yaw, rpy_from_rotation
+from graphloc.frames import Array, Datum, rpy_from_rotation
 from graphloc.frontends.lines import MAX_LINE, Request, Trouble, parse
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement
@@ -53,7 +53,7 @@ def as_json(estimate: Estimate, datum: Datum) -> dict[str, object]:
         "lat_deg": lat,
         "lon_deg": lon,
         "height_m": height,
-        "heading_deg": float(heading_deg_from_yaw(estimate.yaw_rad)),
+        "heading_deg": float(datum.true_heading_deg(estimate.yaw_rad, estimate.p_world_m)),
         "roll_deg": roll,
         "pitch_deg": pitch,
         "map": {**_place(estimate.p_world_m, estimate.R_world_body), "velocity_mps": estimate.v_world_mps.tolist()},

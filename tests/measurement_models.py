@@ -26,6 +26,8 @@ from graphloc.measurements import (
     TagSighting,
 )
 
+_EARTH_M = 6_371_000.0
+
 
 class Situation(NamedTuple):
     """Where the vessel is and how it moves, with symbols of docs/measurement-models.md.
@@ -34,7 +36,7 @@ class Situation(NamedTuple):
         R, p, v: of body in world, v at the measurement. omega: body rate. felt: by the IMU.
         l: lever arm. l_then, M: place and rotation of the sensor at the measurement, seen from the body at the state.
         off: slow state by the names and in the units of outputs, constants by the key that they are added to; 0 where there is none.
-        of_tags: (6,) survey error of each tag.
+        of_tags: (6,) survey error of each tag. latitude_rad: of the datum.
     """
 
     R: Array
@@ -47,6 +49,7 @@ class Situation(NamedTuple):
     felt: FeltMotion
     off: defaultdict[str, float]
     of_tags: tuple[Array, ...]
+    latitude_rad: float
 
     @classmethod
     def of(cls, row: Sensor, config: Any, at: Attachment) -> Situation:
@@ -62,6 +65,7 @@ class Situation(NamedTuple):
         return cls(
             at.T_world_body.rotation().matrix(), at.T_world_body.translation(), at.v_world_mps + at.dv_world_mps, at.gyro_radps,
             at.lever_m, at.T_state_sensor.translation(), at.T_state_sensor.rotation().matrix(), at.felt, off, values,
+            np.radians(at.datum.origin.latitude_deg),
         )  # fmt: skip
 
     def offs(self, *names: str) -> Array:
@@ -72,6 +76,11 @@ class Situation(NamedTuple):
     def o(self) -> Array:
         """How far off its mount a receiver's antenna is, body axes."""
         return self.M @ self.offs("mount.xyz_m[0]", "mount.xyz_m[1]", "mount.xyz_m[2]")
+
+    @property
+    def convergence(self) -> float:
+        """By what north there lies counter-clockwise of the datum's."""
+        return float(self.p[0] / _EARTH_M * np.tan(self.latitude_rad + self.p[1] / _EARTH_M))
 
     def u(self, o: Array) -> Array:
         """Velocity of the sensor."""
@@ -87,7 +96,9 @@ def gnss_velocity(s: Situation, config: Any) -> Array:
     force, alpha, g = s.felt
     arm, w = s.l + s.o, s.omega
     a_o = s.R @ (force + np.cross(alpha, arm) + np.cross(w, np.cross(w, arm))) + g
-    return s.u(s.o) + a_o * s.off["time_offset_s"] + s.offs("east", "north", "up")
+    x, y, _ = s.p / _EARTH_M
+    L = Rotation.from_rotvec([-y, x, s.convergence]).as_matrix()
+    return np.asarray(L.T @ (s.u(s.o) + a_o * s.off["time_offset_s"]) + s.offs("east", "north", "up"))
 
 
 def body_velocity(s: Situation, config: Any) -> Array:
@@ -99,7 +110,7 @@ def body_velocity(s: Situation, config: Any) -> Array:
 
 
 def compass(s: Situation, config: Any) -> Array:
-    y = _rpy(s.R @ s.M)[2]
+    y = _rpy(s.R @ s.M)[2] - s.convergence
     h = np.pi / 2.0 - y
     shares = [1.0, np.sin(h), np.cos(h), np.sin(2.0 * h), np.cos(2.0 * h), 1.0]
     return np.array([y + np.radians(shares @ s.offs("yaw", "B", "C", "D", "E", "wander"))])
@@ -120,7 +131,7 @@ def aerial(s: Situation, config: Any) -> Array:
 
 def height(s: Situation, config: Any) -> Array:
     x, y, up = s.p + s.R @ s.l_then
-    return np.array([up + (x**2 + y**2) / (2.0 * 6_371_000.0) - s.off["up"]])
+    return np.array([up + (x**2 + y**2) / (2.0 * _EARTH_M) - s.off["up"]])
 
 
 MODELS: dict[str, Callable[[Situation, Any], Array]] = {
@@ -144,7 +155,7 @@ def sensed(row: Sensor, config: Any, at: Attachment) -> tuple[Measurement, Array
         case GnssPosition():
             return replace(m, position=Geodetic(*at.datum.geodetic_from_enu(z)[0])), z
         case GnssVelocity():
-            return replace(m, v_world_mps=z), z
+            return replace(m, v_enu_mps=z), z
         case BodyVelocity():
             return replace(m, value=z), z
         case CompassHeading():

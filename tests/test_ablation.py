@@ -284,7 +284,7 @@ def test_a_velocity_counts_what_the_solution_knows_of_velocity(
     assert track.v_world_mps is not None
     made = tuple(
         GnssVelocity(
-            stamp_ns=int(s), sensor="v", seq=k, v_world_mps=v + np.array([0.0, 2.0, 0.0]), cov_m2ps2=np.eye(3) * 0.25
+            stamp_ns=int(s), sensor="v", seq=k, v_enu_mps=v + np.array([0.0, 2.0, 0.0]), cov_m2ps2=np.eye(3) * 0.25
         )
         for k, (s, v) in enumerate(zip(track.stamps_ns[5:-5], track.v_world_mps[5:-5], strict=True))
     )
@@ -350,7 +350,7 @@ def test_velocities_as_late_as_their_stamps_may_be_are_no_contradiction(
     antenna_mps = 5.0 * rate * along - 4.0 * rate * out  # w x (4 m along)
     a_mps2 = -5.0 * rate**2 * out - 4.0 * rate**2 * along
     made = tuple(
-        GnssVelocity(stamp_ns=int(s), sensor="v", seq=k, v_world_mps=v, cov_m2ps2=np.eye(3) * 0.01)
+        GnssVelocity(stamp_ns=int(s), sensor="v", seq=k, v_enu_mps=v, cov_m2ps2=np.eye(3) * 0.01)
         for k, (s, v) in enumerate(zip(track.stamps_ns[5:-5], (antenna_mps + late_s * a_mps2)[5:-5], strict=True))
     )
     for stamp_sigma_s in (0.0, 0.2):

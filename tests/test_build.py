@@ -31,9 +31,7 @@ def velocities(run: SimulatedRun) -> tuple[GnssVelocity, ...]:
     places = truth.p_world_m + truth.R_world_body @ LEVER_M
     v = np.gradient(places, (truth.stamps_ns - truth.stamps_ns[0]) * 1e-9, axis=0)
     return tuple(
-        GnssVelocity(
-            stamp_ns=int(truth.stamps_ns[k]), sensor="vel", seq=k, v_world_mps=v[k], cov_m2ps2=np.eye(3) * 1e-4
-        )
+        GnssVelocity(stamp_ns=int(truth.stamps_ns[k]), sensor="vel", seq=k, v_enu_mps=v[k], cov_m2ps2=np.eye(3) * 1e-4)
         for k in range(105, len(v) - 10, 100)
     )
 

@@ -199,7 +199,7 @@ def test_an_antenna_that_tells_its_velocity_too_is_found(simulated: SimulatedRun
     every = range(10, len(truth) - 10, max(1, round(0.2e9 / (truth.stamps_ns[1] - truth.stamps_ns[0]))))
     told = [
         GnssVelocity(
-            stamp_ns=int(truth.stamps_ns[k]), sensor="velocity", seq=10**6 + k, v_world_mps=v[k] + rng.normal(0.0, 0.05, 3),
+            stamp_ns=int(truth.stamps_ns[k]), sensor="velocity", seq=10**6 + k, v_enu_mps=v[k] + rng.normal(0.0, 0.05, 3),
             cov_m2ps2=0.05**2 * np.eye(3),
         )
         for k in every

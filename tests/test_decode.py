@@ -139,7 +139,7 @@ def test_velocity() -> None:
     cov = np.diag([0.04, 0.09, 0.16, 1.0, 1.0, 1.0])
     v = decode(MAKE.twist(T, (1, 2, 3), cov), VelocityConfig())
     assert isinstance(v, GnssVelocity)
-    np.testing.assert_allclose(v.v_world_mps, [1, 2, 3])
+    np.testing.assert_allclose(v.v_enu_mps, [1, 2, 3])
     np.testing.assert_allclose(v.cov_m2ps2, np.diag([0.04, 0.09, 0.16]))
     np.testing.assert_allclose(decode(MAKE.twist(T, (1, 2, 3)), VelocityConfig()).cov_m2ps2, 0.09 * np.eye(3))
     refused(MAKE.twist(T, (np.nan, 0, 0)), VelocityConfig(), Outcome.MALFORMED, "NaN")
@@ -151,7 +151,7 @@ def test_velocity_in_north_east_down() -> None:
     cov[:3, :3] = [[0.04, 0.01, 0.02], [0.01, 0.09, 0.03], [0.02, 0.03, 0.16]]
     ned = VelocityConfig(convention="ned")
     for msg in (MAKE.twist(T, (1, 2, 3), cov), MAKE.twist(T, (1, 2, 3))):
-        np.testing.assert_allclose(decode(msg, ned).v_world_mps, [2, 1, -3])
+        np.testing.assert_allclose(decode(msg, ned).v_enu_mps, [2, 1, -3])
     told = decode(MAKE.twist(T, (1, 2, 3), cov), ned).cov_m2ps2
     np.testing.assert_allclose(told, [[0.09, 0.01, -0.03], [0.01, 0.04, -0.02], [-0.03, -0.02, 0.16]])
 

@@ -130,7 +130,7 @@ def test_a_gap_is_an_outage_of_gnss_and_of_nothing_else() -> None:
     zero, unit = np.zeros(3), np.eye(3)
     beside = [
         *(
-            GnssVelocity(stamp_ns=s, sensor="v", seq=10**6 + k, v_world_mps=zero, cov_m2ps2=unit)
+            GnssVelocity(stamp_ns=s, sensor="v", seq=10**6 + k, v_enu_mps=zero, cov_m2ps2=unit)
             for k, s in enumerate(stamps)
         ),
         *(
@@ -356,7 +356,7 @@ def test_only_the_honest_filter_takes_a_velocity() -> None:
     antenna = run.truth.p_world_m + run.truth.R_world_body @ np.array([-1.5, 0.3, 2.2789])
     v = np.gradient(antenna, (run.truth.stamps_ns - run.truth.stamps_ns[0]) * 1e-9, axis=0)
     more = [
-        GnssVelocity(stamp_ns=int(n), sensor="vel", seq=10**6 + k, v_world_mps=v[100 * k], cov_m2ps2=np.eye(3) * 0.01)
+        GnssVelocity(stamp_ns=int(n), sensor="vel", seq=10**6 + k, v_enu_mps=v[100 * k], cov_m2ps2=np.eye(3) * 0.01)
         for k, n in enumerate(run.truth.stamps_ns[::100].tolist())
     ]
     with_it = tuple(sorted([*run.recording.measurements, *more], key=lambda m: (m.stamp_ns, m.seq)))

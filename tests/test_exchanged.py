@@ -32,7 +32,7 @@ def said(places: Array, velocities: Array, convention: str = "enu") -> list[str]
     ]
     velocities = np.hstack([velocities + rng.normal(0.0, 0.1, velocities.shape), height])
     moving = [
-        GnssVelocity(stamp_ns=t, sensor="velocity", seq=k, v_world_mps=v, cov_m2ps2=np.eye(3))
+        GnssVelocity(stamp_ns=t, sensor="velocity", seq=k, v_enu_mps=v, cov_m2ps2=np.eye(3))
         for k, (t, v) in enumerate(zip(ns, velocities, strict=True))
     ]
     config = VelocityConfig.model_validate({"topic": "/v", "convention": convention})

@@ -351,7 +351,7 @@ def test_hints_say_what_the_state_says(row: Sensor) -> None:
     if np.isfinite(hint.yaw_rad):
         assert np.isclose(np.exp(1j * hint.yaw_rad), np.exp(1j * at.T_world_body.rotation().yaw()))
     if np.isfinite(hint.v_world_mps).all():
-        np.testing.assert_allclose(hint.v_world_mps, at.v_world_mps, atol=1e-9)
+        np.testing.assert_allclose(DATUM.local_axes(truth) @ hint.v_world_mps, at.v_world_mps, atol=1e-9)
     says = {"gnss": told.all(), "pose": np.isfinite(hint.yaw_rad), "compass": np.isfinite(hint.yaw_rad)}
     assert says.get(row.kind, True)
 

@@ -161,7 +161,7 @@ def with_velocities(antenna: str) -> SimulatedRun:
     v += np.random.default_rng(5).normal(0.0, 0.02, v.shape)
     seq = max(m.seq for m in run.recording.measurements) + 1
     told = [
-        GnssVelocity(stamp_ns=int(at), sensor="v", seq=seq + n, v_world_mps=v[n], cov_m2ps2=np.eye(3) * 0.02**2)
+        GnssVelocity(stamp_ns=int(at), sensor="v", seq=seq + n, v_enu_mps=v[n], cov_m2ps2=np.eye(3) * 0.02**2)
         for n, at in enumerate(inside)
     ]
     both = tuple(sorted([*run.recording.measurements, *told], key=lambda m: (m.stamp_ns, m.seq)))

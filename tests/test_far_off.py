@@ -185,7 +185,7 @@ def jumped(
             moved = np.diff(there.p_world_m + there.R_world_body @ lever, axis=0)[0] / 0.02
             kept.append(
                 GnssVelocity(stamp_ns=m.stamp_ns, sensor="velocity", seq=-1, cov_m2ps2=np.eye(3) * 0.01,
-                             v_world_mps=moved + rng.normal(0.0, 0.1, 3))
+                             v_enu_mps=moved + rng.normal(0.0, 0.1, 3))
             )  # fmt: skip
         elif not isinstance(m, PoseFix):
             kept.append(m)

@@ -544,7 +544,7 @@ def test_a_long_first_window_is_not_dead_reckoned_at_once() -> None:
     moved = truth.at(at_ns + step_ns // 2).p_world_m - truth.at(at_ns - step_ns // 2).p_world_m
     v_world_mps = moved / 0.2 + rng.normal(0.0, 0.1, moved.shape)
     velocities = [
-        GnssVelocity(stamp_ns=int(ns), sensor="velocity", seq=-1, v_world_mps=v, cov_m2ps2=np.eye(3) * 0.01)
+        GnssVelocity(stamp_ns=int(ns), sensor="velocity", seq=-1, v_enu_mps=v, cov_m2ps2=np.eye(3) * 0.01)
         for ns, v in zip(at_ns, v_world_mps, strict=True)
     ]
     fixes = run.recording.of(GnssPosition)

@@ -482,7 +482,7 @@ def test_axes_of_a_velocity(axes: str, said: str, enabled: bool, tmp_path: Path)
     assert config.sensors["body_velocity" if axes == "body" else "gnss_velocity"].enabled is enabled
     if enabled:
         recording = read_recording(tmp_path / "run", config)
-        read = [m.v_world_mps for m in recording.of(GnssVelocity)]
+        read = [m.v_enu_mps for m in recording.of(GnssVelocity)]
         np.testing.assert_allclose(read, v)
 
 
@@ -754,7 +754,7 @@ def test_a_plain_velocity_tells_the_yaw_of_the_imu(tmp_path: Path) -> None:
     assert found.imus[0].mount.rpy_deg == pytest.approx((0.0, 0.0, 90.0), abs=0.5)
     assert config.sensors["gnss_velocity"].enabled
     recording = read_recording(tmp_path / "run", config)
-    told = [m.v_world_mps for m in recording.of(GnssVelocity)]
+    told = [m.v_enu_mps for m in recording.of(GnssVelocity)]
     np.testing.assert_allclose(told, v)
 
 

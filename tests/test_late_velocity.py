@@ -44,7 +44,7 @@ def late(stamp_sigma_s: float, late_s: float = LATE_S) -> SimulatedRun:
     told = [
         GnssVelocity(
             stamp_ns=int(truth.stamps_ns[k]) + late_ns, sensor="velocity", seq=10**6 + k,
-            v_world_mps=v[k] + rng.normal(0.0, 0.05, 3), cov_m2ps2=0.05**2 * np.eye(3),
+            v_enu_mps=v[k] + rng.normal(0.0, 0.05, 3), cov_m2ps2=0.05**2 * np.eye(3),
         )
         for k in every
     ]  # fmt: skip
@@ -104,7 +104,7 @@ def test_a_velocity_is_that_of_the_antenna_at_another_time() -> None:
     m = ROW.ideal(at, config)
     assert isinstance(m, GnssVelocity)
     assert np.linalg.norm(antenna_mps(t + late_s) - antenna_mps(t)) > 0.08
-    np.testing.assert_allclose(m.v_world_mps, antenna_mps(t + late_s), atol=0.004)
+    np.testing.assert_allclose(m.v_enu_mps, antenna_mps(t + late_s), atol=0.004)
 
 
 def rotation(yaw: float, roll: float) -> Array:

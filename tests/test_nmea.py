@@ -307,9 +307,9 @@ def test_course_and_speed_of_rmc_are_drafted_where_no_vtg_says_them(
     velocities = [m for m in read_recording(bag, config).measurements if isinstance(m, GnssVelocity)]
     assert len(velocities) == 200
     # A course at rest says nothing: it is a velocity of zero, as well known to all sides.
-    assert all(not m.v_world_mps[:2].any() for m in velocities[:21])
+    assert all(not m.v_enu_mps[:2].any() for m in velocities[:21])
     assert all(m.cov_m2ps2[0, 0] == m.cov_m2ps2[1, 1] == pytest.approx(0.3**2) for m in velocities)
-    assert velocities[30].v_world_mps[:2] == pytest.approx([2.0, 0.0], abs=2e-3)  # course 90
+    assert velocities[30].v_enu_mps[:2] == pytest.approx([2.0, 0.0], abs=2e-3)  # course 90
 
 
 def gga_bag(path: Path, quality: Callable[[int], int], damaged: int = 0) -> Path:
@@ -544,7 +544,7 @@ def test_the_course_and_speed_of_a_gps_fix_are_a_velocity(tmp_path: Path) -> Non
     recording = read_recording(tmp_path / "run", config)
     read = recording.of(GnssVelocity)
     assert len(read) == len(fixes)
-    np.testing.assert_allclose([m.v_world_mps[:2] for m in read], v[:, :2], atol=0.05)
+    np.testing.assert_allclose([m.v_enu_mps[:2] for m in read], v[:, :2], atol=0.05)
     assert all(m.cov_m2ps2[2, 2] > 1e5 for m in read)  # no climb
 
 
@@ -562,7 +562,7 @@ def test_a_gps_fix_at_rest_without_a_track_stands() -> None:
     fix = gps_fix(Messages(2), S, 57.7, 11.9, speed=0.09, track=float("nan"))
     found = DECODERS["gnss_velocity", "gps_msgs/msg/GPSFix"](fix, S, 0, "v", VelocityConfig())
     assert isinstance(found, GnssVelocity)
-    assert found.v_world_mps[:2] == pytest.approx((0.0, 0.0))
+    assert found.v_enu_mps[:2] == pytest.approx((0.0, 0.0))
 
 
 def test_a_climb_that_the_driver_leaves_at_0_is_none() -> None:
@@ -572,7 +572,7 @@ def test_a_climb_that_the_driver_leaves_at_0_is_none() -> None:
         fix = gps_fix(make, S, 57.7, 11.9, speed=3.0, track=90.0, climb=climb)
         found = DECODERS["gnss_velocity", "gps_msgs/msg/GPSFix"](fix, S, 0, "v", VelocityConfig())
         assert isinstance(found, GnssVelocity)
-        assert found.v_world_mps == pytest.approx((3.0, 0.0, climb))
+        assert found.v_enu_mps == pytest.approx((3.0, 0.0, climb))
         assert (found.cov_m2ps2[2, 2] < 1.0) == told
 
 
@@ -597,7 +597,7 @@ def test_messages_of_other_packages_say_the_same(tmp_path: Path) -> None:
     fixes = [m for m in found if isinstance(m, GnssPosition)]
     assert len(fixes) == 40
     assert np.diagonal(fixes[3].cov_enu_m2) == pytest.approx([0.25, 0.25, 1.0])
-    assert [m.v_world_mps[0] for m in found if isinstance(m, GnssVelocity)] == [3.0] * 40
+    assert [m.v_enu_mps[0] for m in found if isinstance(m, GnssVelocity)] == [3.0] * 40
     assert [m.modes[0].value[0] for m in found if isinstance(m, PoseFix)] == [3.0 * k for k in range(40)]
     seen = inspect_bag(path)
     assert [g.statuses for g in seen.gnss] == [{"sbas": 40}]

@@ -783,7 +783,7 @@ def test_a_wrong_fix_of_rtk_is_not_followed_beside_its_velocity() -> None:
     assert true_mps is not None
     v_mps = true_mps + np.random.default_rng(2).normal(0.0, 0.05, (len(stamps_ns), 3))
     velocities = [
-        GnssVelocity(sensor="velocity", seq=10**7 + n, stamp_ns=at_ns, v_world_mps=v, cov_m2ps2=0.09 * np.eye(3))
+        GnssVelocity(sensor="velocity", seq=10**7 + n, stamp_ns=at_ns, v_enu_mps=v, cov_m2ps2=0.09 * np.eye(3))
         for n, (at_ns, v) in enumerate(zip(stamps_ns.tolist(), v_mps, strict=True))
     ]
     recording = replace(

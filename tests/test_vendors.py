@@ -231,11 +231,11 @@ def test_a_velocity_is_turned_to_east_north_up(msgtype: str) -> None:
     for convention in ("ned", "enu") if known else ("ned",):
         found = read("gnss_velocity", msgtype, fields, convention=convention)
         assert isinstance(found, GnssVelocity)
-        np.testing.assert_allclose(found.v_world_mps, [-1.0, 3.0, -0.5], atol=1e-6)
+        np.testing.assert_allclose(found.v_enu_mps, [-1.0, 3.0, -0.5], atol=1e-6)
         np.testing.assert_allclose(np.sqrt(np.diagonal(found.cov_m2ps2)), [sigma] * 3, rtol=1e-6)
     if not known:  # a driver that is set so says east first
         as_it_is = read("gnss_velocity", msgtype, fields, convention="enu")
-        np.testing.assert_allclose(as_it_is.v_world_mps, [3.0, -1.0, 0.5], atol=1e-6)
+        np.testing.assert_allclose(as_it_is.v_enu_mps, [3.0, -1.0, 0.5], atol=1e-6)
 
 
 @pytest.mark.parametrize("msgtype", HEADINGS)
@@ -573,7 +573,7 @@ def test_one_message_of_px4_is_three_sensors(tmp_path: Path) -> None:
     topics = {name: sensor.topic for name, sensor in config.sensors.items() if sensor.enabled and sensor.topic != "/imu"}  # fmt: skip
     assert topics == dict.fromkeys(("gnss", "compass", "gnss_velocity"), "/fmu/out/vehicle_gps_position")
     recording = read_recording(tmp_path / "run", config)
-    p = [m.v_world_mps for m in recording.measurements if isinstance(m, GnssVelocity)]
+    p = [m.v_enu_mps for m in recording.measurements if isinstance(m, GnssVelocity)]
     assert len(p) == 300
 
 

@@ -31,7 +31,7 @@ def test_the_bound_of_an_outage_grows_as_the_velocity_wanders(solve: Callable[..
     v = antenna_velocity(truth) + np.array([SIGMA_MPS, 0.0, 0.0])
     every = range(10, len(truth) - 2, round(0.2e9 / (truth.stamps_ns[1] - truth.stamps_ns[0])))
     told = [
-        GnssVelocity(stamp_ns=int(truth.stamps_ns[k]), sensor="velocity", seq=10**6 + k, v_world_mps=v[k], cov_m2ps2=0.03**2 * np.eye(3))
+        GnssVelocity(stamp_ns=int(truth.stamps_ns[k]), sensor="velocity", seq=10**6 + k, v_enu_mps=v[k], cov_m2ps2=0.03**2 * np.eye(3))
         for k in every
     ]  # fmt: skip
     kept = [m for m in run.recording.measurements if not isinstance(m, GnssPosition) or m.stamp_ns < out_ns]

@@ -54,7 +54,7 @@ def _measurement(mounted: MountedMeasurement, x: Array, rate: float, datum: Datu
     m, lever = mounted.m, mounted.lever
     c, s = np.cos(x[4]), np.sin(x[4])
     turn = np.array([[c, -s], [s, c]])
-    swing = rate * np.array([-lever[1], lever[0]])
+    swing, place = rate * np.array([-lever[1], lever[0]]), np.array([x[0], x[1], 0.0])
     if isinstance(m, BodyVelocity):
         c, s = np.cos(mounted.mount_yaw), np.sin(mounted.mount_yaw)
         level = [n for n, axis in enumerate(m.axes) if axis != "z"]
@@ -64,12 +64,13 @@ def _measurement(mounted: MountedMeasurement, x: Array, rate: float, datum: Datu
     if isinstance(m, GnssVelocity):
         H = np.zeros((2, 5))
         H[:, 2:4], H[:, 4] = turn, np.array([[-s, -c], [c, -s]]) @ (x[2:4] + swing)
-        return m.v_world_mps[:2] - turn @ (x[2:4] + swing), H, np.array(m.cov_m2ps2[:2, :2])
+        v = datum.local_axes(place) @ m.v_enu_mps
+        return v[:2] - turn @ (x[2:4] + swing), H, np.array(m.cov_m2ps2[:2, :2])
     if isinstance(m, GnssPosition):
         z = world_from_fixes([m], datum)[0, :2]
         values, cov, index = {0: z[0], 1: z[1]}, m.cov_enu_m2[:2, :2], [0, 1]
     elif isinstance(m, CompassHeading):
-        values, cov, index = {4: m.yaw_rad}, np.array([[m.sigma_rad**2]]), [4]
+        values, cov, index = {4: m.yaw_rad + float(datum.convergence_rad(place))}, np.array([[m.sigma_rad**2]]), [4]
     else:
         assert isinstance(m, PoseFix)
         best = max(m.modes, key=lambda mode: mode.probability)

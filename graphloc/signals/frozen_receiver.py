@@ -258,7 +258,7 @@ def without_frozen_fixes(
     # First and last stamps of velocities that are repeated, of a vessel under way.
     hung = np.zeros((0, 2), dtype=np.int64)
     for sensor, velocities in _by_sensor(recording, GnssVelocity).items():
-        stamps_ns, v_mps = stamps_of(velocities), np.array([m.v_world_mps for m in velocities])
+        stamps_ns, v_mps = stamps_of(velocities), np.array([m.v_enu_mps for m in velocities])
         bad = frozen_velocities(stamps_ns, v_mps)
         hanging = runs(bad & (np.linalg.norm(v_mps, axis=1) > UNDER_WAY_MPS))
         hung = np.vstack([hung, stamps_ns[hanging - [0, 1]]])
