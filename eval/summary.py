@@ -113,21 +113,22 @@ def metric_tables(runs: Sequence[FinishedRun], *, shown_only: bool = True) -> li
     found = []
     for title in dict.fromkeys(t for run in runs for t in run.tables):
         having = [run for run in runs if title in run.tables]
-        estimates = tuple(dict.fromkeys(e for run in having for e in run.tables[title]))
         metrics = list(dict.fromkeys(m for run in having for row in run.tables[title].values() for m in row))
-        for metric in _shown(title, metrics) if shown_only else metrics:
-            rows = tuple(
-                (run.name, tuple(run.tables[title].get(e, {}).get(metric) for e in estimates)) for run in having
-            )
-            columns = [[v for v in column if v is not None] for column in zip(*(v for _, v in rows), strict=True)]
-            found.append(
-                MetricTable(
-                    title=title, metric=metric, estimates=estimates, rows=rows,
-                    mean=tuple(sum(c) / len(c) if c else None for c in columns),
-                    worst=tuple(_worst(metric, c) for c in columns),
-                )
-            )  # fmt: skip
+        shown = _shown(title, metrics) if shown_only else metrics
+        found += [_metric_table(title, metric, having) for metric in shown]
     return found
+
+
+def _metric_table(title: str, metric: str, having: Sequence[FinishedRun]) -> MetricTable:
+    """Return one number of the table of that title, of the runs that have it."""
+    estimates = tuple(dict.fromkeys(e for run in having for e in run.tables[title]))
+    rows = tuple((run.name, tuple(run.tables[title].get(e, {}).get(metric) for e in estimates)) for run in having)
+    columns = [[v for v in column if v is not None] for column in zip(*(v for _, v in rows), strict=True)]
+    return MetricTable(
+        title=title, metric=metric, estimates=estimates, rows=rows,
+        mean=tuple(sum(c) / len(c) if c else None for c in columns),
+        worst=tuple(_worst(metric, c) for c in columns),
+    )  # fmt: skip
 
 
 def _shown(title: str, metrics: Sequence[str]) -> Sequence[str]:

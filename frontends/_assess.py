@@ -57,6 +57,22 @@ class Courses:
     course_rad: Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceTrack:
+    """Where the craft was, by its best receiver: stamps (N,), places (N, 3), m, east, north, up.
+
+    `scatter_m`: their noise, 1 sigma of an axis. `first`: latitude, longitude (deg) and height (m) that they are about; None of poses in a map grid.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    p_m: Array
+    scatter_m: float
+    first: Vec | None = None
+
+
+NO_TRACK = ReferenceTrack(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), 1.0)
+
+
 def vec(values: ArrayLike) -> Vec:
     """Return three numbers as a tuple."""
     a, b, c = (float(v) for v in np.asarray(values))
@@ -179,9 +195,10 @@ def _placed(fixes: TopicData) -> tuple[NDArray[np.intp], Array]:
     return keep, rows
 
 
-def courses_of(stamps_ns: NDArray[np.int64], p_m: Array, noise_m: float) -> Courses:
+def courses_of(way: ReferenceTrack) -> Courses:
     """Return the direction of chords of the track long enough that its noise does not turn them."""
-    reach = max(3.0, 8.0 * noise_m)
+    stamps_ns, p_m = way.stamps_ns, way.p_m
+    reach = max(3.0, 8.0 * way.scatter_m)
     at, course = [], []
     j = 0
     for i in range(len(stamps_ns)):
@@ -203,7 +220,7 @@ def courses_of_fixes(fixes: Sequence[GnssPosition]) -> Courses:
     if len(fixes) < 20:
         return Courses(np.zeros(0, dtype=np.int64), np.zeros(0))
     p = world_from_fixes(fixes, Datum(fixes[0].position))[:, :2]
-    return courses_of(stamps_of(fixes), p, float(white_noise(p).max()))
+    return courses_of(ReferenceTrack(stamps_of(fixes), p, float(white_noise(p).max())))
 
 
 def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> MeasuredMotion | None:

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,67 +34,94 @@ _EITHER_WAY, _OFTEN, _MOST = 0.15, 0.1, 0.6
 _RELATIVE_DEG = 30.0  # off the course, from which an IMU's orientation has a north of its own
 
 
+class _Conventions(NamedTuple):
+    """What tells the convention of a heading: its type, the gyroscope, and what the maker's driver comes with; None where it does not."""
+
+    told: str | None
+    by_gyro: str | None
+    usual: str | None
+
+
 def compass_report(stream: TopicData, courses: Courses | None, turning: Turning | None) -> CompassReport | None:
     """Return whether an orientation is a heading, and in which convention; None where there is none."""
     keep = sane(stream)
     if len(keep) < _FEWEST or _left_out(stream, stream.rows[keep]):
         return None
     stamps_ns, angle = headings(stream)
-    # Drivers of receivers with two antennas fill an Imu with the orientation alone.
-    gnss = not stream.rows[keep, :6].any() if stream.msgtype == IMU else two_antennas(stream.topic)
     part = stream.part
-    gnss = gnss if part is None else part.antennas
-    told = "enu" if part is not None and part.told else None
-    default = "enu" if part is None or part.told else part.usual
-    plain: dict[str, Any] = {
-        "topic": stream.topic,
-        "msgtype": stream.msgtype,
-        "unit": unit_of(stream),
-        "two_antennas": gnss,
-    }
-    untold: dict[str, Any] = {"offset_deg": None, "scatter_deg": None, "samples": 0}
+    report = CompassReport(
+        topic=stream.topic,
+        msgtype=stream.msgtype,
+        usable=False,
+        convention="enu" if part is None or part.told else part.usual,
+        offset_deg=None,
+        scatter_deg=None,
+        samples=0,
+        why="its messages give no yaw",
+        unit=unit_of(stream),
+        two_antennas=_of_two_antennas(stream, stream.rows[keep]),
+    )
     if len(stamps_ns) < _FEWEST:
-        return CompassReport(**plain, **untold, usable=False, convention=default, why="its messages give no yaw")
-    by_gyro = {1: "enu", -1: "ned"}.get(against_turning(turning, stamps_ns, angle))
-    courses = _heard(courses, stamps_ns)
-    heard = 0 if courses is None else len(courses.stamps_ns)
-    if courses is None or heard < _FEWEST_COURSES:
-        why = "no GNSS course in motion to check it against" + (
-            ", convention from the gyro" if by_gyro and not told else ""
-        )
-        if courses is not None and not heard and stream.msgtype in NUMBERS:
-            why = "no GNSS course in motion at the times it was recorded (it has no stamp)"
-        named = stream.msgtype == QUATERNION  # a topic of bare orientations is meant as a compass
-        return CompassReport(**plain, **untold, usable=named, convention=told or by_gyro or default, why=why)
-    origin = int(stream.stamps_ns[keep[0]])
-    usual = part.usual if part is not None else None
-    fit = _beside_courses(
-        (stamps_ns - origin) / NS_PER_S, angle, (courses.stamps_ns - origin) / NS_PER_S, courses, told or by_gyro, usual
+        return report
+    known = _Conventions(
+        told="enu" if part is not None and part.told else None,
+        by_gyro={1: "enu", -1: "ned"}.get(against_turning(turning, stamps_ns, angle)),
+        usual=None if part is None else part.usual,
     )
-    # Courses tell headings of a vessel that goes ahead; of one that is set sideways only the gyroscope tells whether it is one. But
-    # an IMU's own orientation follows the gyroscope wherever north is. Two antennas know north, and an Imu of an orientation alone is
-    # taken for such; athwart, they are a quarter turn off.
-    quarter = gnss and fit.scatter_deg < _SIDEWAYS_DEG and abs(abs(fit.offset_deg) - 90.0) < _ASKEW_DEG
-    fits_course = bool(fit.scatter_deg < _SCATTERS_DEG)
-    sideways = (
-        not fits_course
-        and by_gyro is not None
-        and (stream.msgtype != IMU or abs(fit.offset_deg) < _RELATIVE_DEG or quarter)
-        and follows_turning(turning, stamps_ns, _in_enu(angle, fit.convention))
-    )
-    by_turns = sideways and not quarter  # no course tells how it is mounted
-    return CompassReport(
-        **plain,
-        usable=fits_course or sideways,
+    heard = _heard(courses, stamps_ns)
+    if heard is None or len(heard.stamps_ns) < _FEWEST_COURSES:
+        return _without_courses(report, known, heard)
+    fit = _beside_courses(stamps_ns, angle, heard, known)
+    judged = fit.good or known.by_gyro is None
+    follows = not judged and follows_turning(turning, stamps_ns, in_enu(angle, fit.convention))
+    return _by_courses(report, known, fit, heard, follows=follows)
+
+
+def _without_courses(report: CompassReport, known: _Conventions, heard: Courses | None) -> CompassReport:
+    """Return the report of a heading at whose times there are no courses, or few: a topic of bare orientations is meant as a compass."""
+    why = "no GNSS course in motion to check it against"
+    if heard is not None and not len(heard.stamps_ns) and report.msgtype in NUMBERS:
+        why = "no GNSS course in motion at the times it was recorded (it has no stamp)"
+    elif known.by_gyro and not known.told:
+        why += ", convention from the gyro"
+    convention = known.told or known.by_gyro or report.convention
+    return replace(report, usable=report.msgtype == QUATERNION, convention=convention, why=why)
+
+
+def _by_courses(
+    report: CompassReport, known: _Conventions, fit: _Fit, courses: Courses, *, follows: bool
+) -> CompassReport:
+    """Return the report of a heading beside the courses of the fixes.
+
+    Courses tell headings of a vessel that goes ahead; of one that is set sideways only the gyroscope tells whether it is one. But
+    an IMU's own orientation follows the gyroscope wherever north is. Two antennas know north, and an Imu of an orientation alone is
+    taken for such; athwart, they are a quarter turn off.
+
+    Args:
+        follows: whether it turns as the gyroscope does, though not with the courses.
+    """
+    quarter = report.two_antennas and fit.scatter_deg < _SIDEWAYS_DEG and abs(abs(fit.offset_deg) - 90.0) < _ASKEW_DEG
+    knows_north = report.msgtype != IMU or abs(fit.offset_deg) < _RELATIVE_DEG or quarter
+    sideways = knows_north and follows
+    report = replace(
+        report,
+        usable=fit.good or sideways,
         convention=fit.convention,
-        offset_deg=None if by_turns else fit.offset_deg,
         scatter_deg=fit.scatter_deg,
-        leeway_deg=None
-        if by_turns
-        else _wanders_deg(courses.stamps_ns, _ahead(fit.apart_rad, np.radians(fit.offset_deg))),
         samples=len(fit.apart_rad),
-        why=_why(fit, by_gyro, told=told is not None, fits_course=fits_course, sideways=sideways),
+        why=_why(fit, known, sideways=sideways),
     )
+    if sideways and not quarter:  # no course tells how it is mounted
+        return report
+    leeway_deg = _wanders_deg(courses.stamps_ns, _ahead(fit.apart_rad, np.radians(fit.offset_deg)))
+    return replace(report, offset_deg=fit.offset_deg, leeway_deg=leeway_deg)
+
+
+def _of_two_antennas(stream: TopicData, rows: Array) -> bool:
+    """Return whether a heading is one of GNSS. Drivers of receivers with two antennas fill an Imu with the orientation alone."""
+    if stream.part is not None:
+        return stream.part.antennas
+    return not rows[:, :6].any() if stream.msgtype == IMU else two_antennas(stream.topic)
 
 
 def _left_out(stream: TopicData, rows: Array) -> bool:
@@ -114,7 +142,8 @@ def _heard(courses: Courses | None, stamps_ns: NDArray[np.int64]) -> Courses | N
     return Courses(courses.stamps_ns[within], courses.course_rad[within])
 
 
-def _in_enu(angle: Array, convention: str) -> Array:
+def in_enu(angle: Array, convention: str) -> Array:
+    """Return headings (N,), rad, as yaw from east, counter-clockwise."""
     return angle if convention == "enu" else np.pi / 2.0 - angle
 
 
@@ -134,18 +163,21 @@ class _Fit(NamedTuple):
     apart_rad: Array
     straight: bool
 
+    @property
+    def good(self) -> bool:
+        """Whether it is a heading by that."""
+        return self.scatter_deg < _SCATTERS_DEG
 
-def _beside_courses(
-    t_s: Array, angle: Array, courses_s: Array, courses: Courses, by_gyro: str | None, usual: str | None
-) -> _Fit:
-    """Return how a heading fits the courses, in the convention that the gyroscope tells, or that fits best.
+
+def _beside_courses(stamps_ns: NDArray[np.int64], angle: Array, courses: Courses, known: _Conventions) -> _Fit:
+    """Return how a heading fits the courses, in the convention that its type or the gyroscope tells, or that fits best.
 
     Args:
-        t_s, angle: (N,) s; (N,) rad, unwrapped. courses_s: (M,), s, of the courses, from the same origin.
-        usual: of a maker's driver, the convention that it comes with.
+        stamps_ns, angle: (N,) ns; (N,) rad, unwrapped.
     """
-    measured = np.interp(courses_s, t_s, angle)
-    apart = {convention: _in_enu(measured, convention) - courses.course_rad for convention in ("enu", "ned")}
+    origin = stamps_ns[0]
+    measured = np.interp((courses.stamps_ns - origin) / NS_PER_S, (stamps_ns - origin) / NS_PER_S, angle)
+    apart = {convention: in_enu(measured, convention) - courses.course_rad for convention in ("enu", "ned")}
     fits = {convention: _beside_either_way(off) for convention, off in apart.items()}
     turned = float(np.degrees(np.sqrt(max(0.0, -2.0 * np.log(max(abs(np.exp(1j * courses.course_rad).mean()), 1e-9))))))
     straight = turned < _STRAIGHT_DEG
@@ -155,12 +187,12 @@ def _beside_courses(
         if not straight:
             return (scatter_deg,)
         # On a straight both conventions fit with some offset: the smaller offset is likelier, of two antennas one of quarter turns.
-        if usual is None:
+        if known.usual is None:
             return (abs(offset_deg),)
         askew = abs((offset_deg + 45.0) % 90.0 - 45.0) > _ASKEW_DEG
-        return askew, round(abs(offset_deg) / 90.0), convention != usual
+        return askew, round(abs(offset_deg) / 90.0), convention != known.usual
 
-    convention = by_gyro or min(fits, key=unlikely)
+    convention = known.told or known.by_gyro or min(fits, key=unlikely)
     return _Fit(convention, *fits[convention], apart[convention], straight)
 
 
@@ -183,17 +215,17 @@ def _beside_either_way(apart: Array) -> tuple[float, float, float]:
     return bow_deg, 0.5 * twice_scatter_deg, share
 
 
-def _why(fit: _Fit, by_gyro: str | None, *, told: bool, fits_course: bool, sideways: bool) -> str:
+def _why(fit: _Fit, known: _Conventions, *, sideways: bool) -> str:
     why = f"yaw minus GNSS course: {fit.offset_deg:+.0f} deg, scatter {fit.scatter_deg:.0f} deg over {len(fit.apart_rad)} courses"
     if fit.astern:
         why += f", {100.0 * fit.astern:.0f} % of them astern"
     if sideways:
         return f"{why}: a vessel that often goes sideways, since it turns as the gyro does"
-    if not fits_course:
+    if not fit.good:
         return f"{why}: a relative or a disturbed heading, or a vessel that often goes sideways"
-    if told:
+    if known.told:
         return f"{why}; convention known by its type"
-    if by_gyro:
+    if known.by_gyro:
         return f"{why}; convention from the gyro"
     return f"{why}, on a nearly straight track: the convention is not certain" if fit.straight else why
 

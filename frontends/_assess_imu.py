@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +28,7 @@ from graphloc.frontends._sanity import (
     without_gravity,
 )
 from graphloc.frontends._streams import TopicData
-from graphloc.frontends._tf import StaticTree
+from graphloc.frontends._tf import Pose, StaticTree
 from graphloc.frontends.turning import Turning, course_against_turning, left_of_turns
 from graphloc.measurements import ImuSeries
 from graphloc.signals.frozen_imu import frozen_imu_warning, frozen_samples
@@ -60,42 +60,63 @@ def samples_of(imu: TopicData) -> tuple[NDArray[np.intp], list[str]]:
     return keep[~bad], frozen_imu_warning(imu.topic, imu.stamps_ns[keep], bad)
 
 
-def mount_guess(
-    imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion], tree: StaticTree, body: str
-) -> MountGuess:
+class _Samples(NamedTuple):
+    """Usable samples of an IMU: stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s, and their frame."""
+
+    frame_id: str
+    stamps_ns: NDArray[np.int64]
+    accel: Array
+    gyro: Array
+
+    def turned(self, R: Array) -> _Samples:
+        """Return them in axes turned by R (3, 3)."""
+        return self._replace(accel=self.accel @ R.T, gyro=self.gyro @ R.T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuEvidence:
+    """What an IMU is judged by: how the craft moved, by each source, the courses of the fixes, and tf."""
+
+    motions: Sequence[MeasuredMotion]
+    courses: Courses | None
+    tree: StaticTree
+
+    def pose_of(self, frame: str | None) -> Pose | None:
+        """Return T_body_frame by tf; None where it does not know the frame."""
+        return self.tree.resolve(self.tree.body(), frame) if frame in self.tree.frames else None
+
+
+def _mount_guess(samples: _Samples, evidence: ImuEvidence) -> MountGuess:
     """Return the IMU's mount in body: from tf, else levelled by gravity and aligned with the motion.
 
     Drivers publish in axes of their own under the frame of the URDF. Gravity or the motion overrules the latter where it is off by a
     quarter turn; half a turn about the vertical may be a craft that goes astern.
-
-    Args:
-        accel, gyro: (N, 3) m/s^2, (N, 3) rad/s, of usable samples.
     """
-    pose = tree.resolve(body, imu.frame_id) if imu.frame_id in tree.frames else None
+    motions, pose = evidence.motions, evidence.pose_of(samples.frame_id)
     if pose is None:
-        return _measured_mount(imu, accel, gyro, motions)
-    tilt_deg = _tilt_deg(pose[1], accel)
+        return _measured_mount(samples, motions)
+    tilt_deg = _tilt_deg(pose[1], samples.accel)
     if abs(tilt_deg - 90.0) < _QUARTER_DEG:
-        return _in_place_of(pose, tilt_deg, _measured_mount(imu, accel, gyro, motions))
+        return _in_place_of(pose, tilt_deg, _measured_mount(samples, motions))
     note = "" if tilt_deg < _TILTED_DEG else f"; but then gravity is {tilt_deg:.0f} deg off body z: check it"
     if not note and motions:
-        body_axes = accel @ pose[1].T, gyro @ pose[1].T
-        turned = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], *body_axes, motions)
+        in_body = samples.turned(pose[1])
+        turned = yaw_in_craft(in_body.stamps_ns, in_body.accel, in_body.gyro, motions)
         if turned is not None and turned.astray:
             if abs(abs(turned.yaw_deg) - 90.0) < _QUARTER_DEG and turned.coherence > _OVERRULES:
                 said = f"not as in tf, since {turned.said}: tf is right only if the craft goes sideways throughout"
-                return replace(_turned(imu, accel, gyro, motions, pose[1], said), xyz_m=vec(pose[0]))
+                return replace(_turned(samples, motions, pose[1], said), xyz_m=vec(pose[0]))
             note = f"; but {turned.said}: check it"
     rpy = vec(np.degrees(rpy_from_rotation(pose[1])))
-    return MountGuess(rpy_deg=rpy, tf_frame=imu.frame_id, evidence=f"from tf{note}")
+    return MountGuess(rpy_deg=rpy, tf_frame=samples.frame_id, evidence=f"from tf{note}")
 
 
-def _measured_mount(imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion]) -> MountGuess:
+def _measured_mount(samples: _Samples, motions: Sequence[MeasuredMotion]) -> MountGuess:
     """Return the mount that gravity levels and the motion turns."""
-    up = np.median(accel, axis=0)
+    up = np.median(samples.accel, axis=0)
     size = float(np.linalg.norm(up))
     if size < 0.5 * STANDARD_GRAVITY_MPS2:
-        return _turned(imu, accel, gyro, motions, np.eye(3), "no gravity to find the level from: taken as level")
+        return _turned(samples, motions, np.eye(3), "no gravity to find the level from: taken as level")
     axis = up / size
     snapped = np.zeros(3)
     k = int(np.argmax(np.abs(axis)))
@@ -108,8 +129,8 @@ def _measured_mount(imu: TopicData, accel: Array, gyro: Array, motions: Sequence
     )
     off_deg = float(np.degrees(np.arccos(np.clip(axis @ snapped, -1.0, 1.0))))
     if not aligned or off_deg < _SLIGHTLY_DEG:
-        return _turned(imu, accel, gyro, motions, level, said)
-    mount = _turned(imu, accel, gyro, motions, level, f"{said}, {off_deg:.0f} deg off")
+        return _turned(samples, motions, level, said)
+    mount = _turned(samples, motions, level, f"{said}, {off_deg:.0f} deg off")
     turn = Rotation.from_euler("xyz", mount.rpy_deg, degrees=True).as_matrix() @ level.T
     roll, pitch, yaw = np.degrees(rpy_from_rotation(turn @ _level(axis))).tolist()
     square = f"drafted in steps of 90 deg: if the sensor is tilted in the craft, rather than the craft itself, set [{roll:.1f}, {pitch:.1f}, {yaw:.1f}]"
@@ -129,11 +150,9 @@ def _in_place_of(pose: tuple[Array, Array], tilt_deg: float, mount: MountGuess) 
     return replace(mount, xyz_m=vec(pose[0]), evidence=why)
 
 
-def _turned(
-    imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion], level: Array, said: str
-) -> MountGuess:
+def _turned(samples: _Samples, motions: Sequence[MeasuredMotion], level: Array, said: str) -> MountGuess:
     """Return the mount of a sensor that `level` (3, 3) levels, aligned with the motion; `said`: why it is known."""
-    yaw, sigma, evidence = _mount_yaw(imu, accel @ level.T, gyro @ level.T, motions)
+    yaw, sigma, evidence = _mount_yaw(samples.turned(level), motions)
     told = yaw is not None
     if yaw is None:
         ahead = level[:, 2] if level[2, 1] < _CAMERA else np.array([1.0, 0.0, 0.0])
@@ -179,16 +198,14 @@ def _level(axis: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(angle * cross / sine).as_matrix() @ turned)
 
 
-def _mount_yaw(
-    imu: TopicData, accel: Array, gyro: Array, motions: Sequence[MeasuredMotion]
-) -> tuple[float | None, float | None, str]:
-    """Return the yaw (deg) that fits the motion, None where nothing tells it, and the evidence; `accel`, `gyro` are levelled.
+def _mount_yaw(levelled: _Samples, motions: Sequence[MeasuredMotion]) -> tuple[float | None, float | None, str]:
+    """Return the yaw (deg) that fits the motion, None where nothing tells it, and the evidence.
 
     It is a multiple of 90 deg unless the motion clearly contradicts that: then 1 sigma of it, deg, comes with it, else None.
     """
     if not motions:
         return None, None, "no motion to find its yaw from"
-    found = yaw_in_craft(imu.stamps_ns[samples_of(imu)[0]], accel, gyro, motions)
+    found = yaw_in_craft(levelled.stamps_ns, levelled.accel, levelled.gyro, motions)
     if found is None:
         return None, None, "too little motion to find its yaw from"
     quarter = 90.0 * round(found.yaw_deg / 90.0)
@@ -211,28 +228,36 @@ def _mount_yaw(
     return yaw, found.error_deg if askew else None, said
 
 
-def turning_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Turning:
+class Inertial(NamedTuple):
+    """What an IMU tells: the motion, in the axes of the vessel, and its usable samples, in its own."""
+
+    felt: Felt
+    series: ImuSeries
+
+
+def inertial_of(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> Inertial:
+    """Return what an IMU tells whose mount is known or guessed."""
+    series = _series_of(imu, report)
+    gravity_mps2 = 0.0 if report.gravity == "removed" else STANDARD_GRAVITY_MPS2
+    return Inertial(Felt.of(*_in_body(series, report, evidence), gravity_mps2), series)
+
+
+def _turning_of(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> Turning:
     """Return the integrated rate of an IMU whose mount is known or guessed, with its gyro bias removed if known."""
-    stamps, _, gyro = _in_body(imu, report, tree, body)
+    stamps, _, gyro = _in_body(_series_of(imu, report), report, evidence)
     t = (stamps - stamps[0]) / NS_PER_S
     return Turning(int(stamps[0]), t, integral(t, gyro[:, 2]))
 
 
-def felt_of(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> Felt:
-    """Return the motion by an IMU whose mount is known or guessed, in the axes of the vessel."""
-    return Felt.of(*_in_body(imu, report, tree, body), 0.0 if report.gravity == "removed" else STANDARD_GRAVITY_MPS2)
-
-
-def _in_body(imu: TopicData, report: ImuReport, tree: StaticTree, body: str) -> tuple[NDArray[np.int64], Array, Array]:
-    """Return stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the vessel."""
-    series = series_of(imu, report)
-    known = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
+def _in_body(series: ImuSeries, report: ImuReport, evidence: ImuEvidence) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the vessel, without the gyro bias, if known."""
+    known = evidence.pose_of(report.mount.tf_frame)
     R = known[1] if known else Rotation.from_euler("xyz", report.mount.rpy_deg, degrees=True).as_matrix()
     unbiased = series.gyro_radps - (report.gyro_bias_radps or (0.0, 0.0, 0.0))
     return series.stamps_ns, series.accel_mps2 @ R.T, unbiased @ R.T
 
 
-def series_of(imu: TopicData, report: ImuReport) -> ImuSeries:
+def _series_of(imu: TopicData, report: ImuReport) -> ImuSeries:
     """Return the usable samples of an IMU that has a report, in SI units, axes of the sensor."""
     keep, _ = samples_of(imu)
     keep = keep[np.isfinite(imu.rows[keep, :6]).all(axis=1)]
@@ -246,73 +271,60 @@ def series_of(imu: TopicData, report: ImuReport) -> ImuSeries:
     )
 
 
-def _against_courses(imu: TopicData, report: ImuReport, courses: Courses | None, tree: StaticTree, body: str) -> int:
+def _against_courses(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> int:
     """Return +1 if the gyro turns like the course of the fixes, -1 if opposite, 0 if unclear."""
+    courses = evidence.courses
     if courses is None or len(courses.stamps_ns) < 20:
         return 0
-    turning, course = turning_of(imu, report, tree, body), np.unwrap(courses.course_rad)
+    turning, course = _turning_of(imu, report, evidence), np.unwrap(courses.course_rad)
     return course_against_turning(turning, courses.stamps_ns, course)
 
 
-def _turning_axis(
-    imu: TopicData, report: ImuReport, courses: Courses | None, tree: StaticTree, body: str
-) -> Array | None:
+def _turning_axis(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> Array | None:
     """Return the axis (3,) of the sensor, or its opposite, about which it turns as the courses of the fixes do; None if nothing tells."""
+    courses = evidence.courses
     if courses is None or len(courses.stamps_ns) < 20:
         return None
     course, left = np.unwrap(courses.course_rad), []
     axes = np.vstack([np.eye(3), -np.eye(3)])
     for axis in axes:
         mount = replace(report.mount, rpy_deg=vec(np.degrees(rpy_from_rotation(_level(axis)))))
-        turning = turning_of(imu, replace(report, mount=mount), tree, body)
+        turning = _turning_of(imu, replace(report, mount=mount), evidence)
         left.append(left_of_turns(turning, courses.stamps_ns, course))
     return axes[int(np.argmin(left))] if min(left) < _LEFT_OF_TURNS else None
 
 
-def _righted(
-    report: ImuReport,
-    imu: TopicData,
-    samples: tuple[Array, Array],
-    motions: Sequence[MeasuredMotion],
-    courses: Courses | None,
-    tree: StaticTree,
-    body: str,
-) -> ImuReport:
+def _righted(report: ImuReport, imu: TopicData, samples: _Samples, evidence: ImuEvidence) -> ImuReport:
     """Return the report with accelerations of the opposite sign, if only that fits the courses.
 
     Levelled by accelerations of the wrong sign, the sensor is upside down and its gyroscope turns the wrong way. If the mount is from
     tf, the gyroscope turns correctly, and gravity points down.
-
-    Args:
-        samples: acceleration (N, 3) m/s^2 and rate (N, 3) rad/s of usable samples.
     """
-    accel, gyro = samples
-    pose = tree.resolve(body, report.mount.tf_frame) if report.mount.tf_frame else None
+    motions, pose = evidence.motions, evidence.pose_of(report.mount.tf_frame)
     if pose is None and report.gravity == "removed":
-        up = _turning_axis(imu, report, courses, tree, body)
+        up = _turning_axis(imu, report, evidence)
         if up is None or up[2] > 0.0:
             return report
         name = f"{'+' if up.sum() > 0.0 else '-'}{'xyz'[int(np.abs(up).argmax())]}"
         why = (
             f"its gyro turns about {name} as the courses of the fixes do: taken for up, as there is no gravity to tell"
         )
-        return replace(report, mount=_turned(imu, accel, gyro, motions, _level(up), why))
-    sense = _against_courses(imu, report, courses, tree, body)
+        return replace(report, mount=_turned(samples, motions, _level(up), why))
+    sense = _against_courses(imu, report, evidence)
     if sense == 0:
         return report
     against = "its gyro turns against the courses of the fixes"
     if pose is None and sense < 0:
         why = f"{against}: its accelerations look inverted, or its axes are left-handed; or the fixes have latitude and longitude swapped"
-        mount = mount_guess(imu, -accel, gyro, motions, tree, body)
+        mount = _mount_guess(samples._replace(accel=-samples.accel), evidence)
         mount = replace(mount, evidence=f"with accelerations inverted, {mount.evidence}")
         return replace(report, gravity="inverted", mount=mount, why=(*report.why, why))
     if pose is None:
         return report
-    up = np.asarray(pose[1]) @ np.median(accel, axis=0)
+    up = np.asarray(pose[1]) @ np.median(samples.accel, axis=0)
     upside_down = float(up[2]) < np.cos(np.radians(_UPSIDE_DOWN_DEG)) * float(np.linalg.norm(up))
     if sense < 0 and upside_down and report.gravity == "included":
-        measured = _measured_mount(imu, accel, gyro, motions)
-        mount = _in_place_of(pose, _tilt_deg(pose[1], accel), measured)
+        mount = _in_place_of(pose, _tilt_deg(pose[1], samples.accel), _measured_mount(samples, motions))
         return replace(report, mount=mount, why=(*report.why, f"{against}: the mount in tf is upside down"))
     if sense < 0:
         why = f"{against}: the mount in tf is upside down, or its axes are left-handed; check both"
@@ -326,9 +338,7 @@ def _righted(
     return report
 
 
-def imu_report(
-    imu: TopicData, motions: Sequence[MeasuredMotion], courses: Courses | None, tree: StaticTree, body: str
-) -> ImuReport | None:
+def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
     """Return units, gravity, standstill, noise and mount of an IMU; None if it has less than 20 samples."""
     keep, frozen = samples_of(imu)
     rows = imu.rows[keep] if len(keep) else np.zeros((0, 13))
@@ -344,7 +354,7 @@ def imu_report(
     spiked = spike_warning(imu.topic, stamps, spikes(stamps, np.hstack([accel, gyro])))
     cut = saturation_warning(imu.topic, accel[finite], gyro[finite])
     up = np.median(accel, axis=0)
-    still = _standstill(stamps, accel, gyro, next((m for m in motions if m.rests), None))
+    still = _standstill(stamps, accel, gyro, next((m for m in evidence.motions if m.rests), None))
     root_dt = float(np.sqrt(np.median(np.diff(stamps)) / NS_PER_S))
     quiet = still.sum() > 20
 
@@ -352,6 +362,7 @@ def imu_report(
         variance = float(np.median(rows[:, column]))
         return float(np.sqrt(variance)) * root_dt / unit if np.isfinite(variance) and variance > 0.0 else None
 
+    samples = _Samples(imu.frame_id, stamps, accel, gyro)
     ug, mdps = 1e-6 * STANDARD_GRAVITY_MPS2, np.radians(1e-3)
     report = ImuReport(
         topic=imu.topic,
@@ -367,10 +378,10 @@ def imu_report(
         gyro_noise_mdps=float(white_noise(gyro).max()) * root_dt / mdps,
         reported_accel_ug=reported(10, ug),
         reported_gyro_mdps=reported(11, mdps),
-        mount=mount_guess(imu, accel, gyro, motions, tree, body),
+        mount=_mount_guess(samples, evidence),
         missing=missing,
     )
-    return _righted(report, imu, (accel, gyro), motions, courses, tree, body)
+    return _righted(report, imu, samples, evidence)
 
 
 class _Units(NamedTuple):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation
-from graphloc.frontends._assess import MeasuredMotion, motion_of_places, sane, track, vec
+from graphloc.frontends._assess import MeasuredMotion, ReferenceTrack, motion_of_places, sane, track, vec
 from graphloc.frontends._assess_world import World
 from graphloc.frontends._reports import (
     BODY_AXES,
@@ -47,38 +47,31 @@ _ALONG = 0.9  # of its x along that of the body: a log that is turned by more te
 _REVERSED = "it goes astern nearly all the time: its sign looks wrong, and is taken for reversed"
 
 
-def axes_of(
-    stream: TopicData,
-    stamps_ns: NDArray[np.int64],
-    p_m: Array,
-    scatter_m: float = 0.0,
-    R_body_sensor: Array | None = None,
-) -> tuple[str | None, str]:
+def axes_of(stream: TopicData, reference: ReferenceTrack, R_body_sensor: Array | None = None) -> tuple[str | None, str]:
     """Return the axes in which the velocities of a stream fit chords of a track, and the evidence in words.
 
     The axes are None if the data do not show them, 'unknown' if none fits, `EITHER` if two do.
 
     Args:
-        stream: velocities in its last three columns. stamps_ns: (N,) of the track. p_m: (N, 3) the track, east, north, up.
-        scatter_m: noise of its positions, 1 sigma of an axis. R_body_sensor: (3, 3), where its axes are turned in the body.
+        stream: velocities in its last three columns. R_body_sensor: (3, 3), where its axes are turned in the body.
     """
     R = np.eye(3) if R_body_sensor is None else R_body_sensor
-    axes, why = _axes_by(stream, stamps_ns, p_m, scatter_m, _CHORD_S, R)
+    axes, why = _axes_by(stream, reference, _CHORD_S, R)
     if axes == "unknown":
-        over, why_over = _axes_by(stream, stamps_ns, p_m, scatter_m, _LONG_CHORD_S, R)
+        over, why_over = _axes_by(stream, reference, _LONG_CHORD_S, R)
         if over in (EAST_AXES, NORTH_AXES):
             return over, f"{why_over}, over {_LONG_CHORD_S:.0f} s: the fixes wander"
     return axes, why
 
 
 def _axes_by(
-    stream: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float, chord_s: float, R_body_sensor: Array
+    stream: TopicData, reference: ReferenceTrack, chord_s: float, R_body_sensor: Array
 ) -> tuple[str | None, str]:
     """Return the same by chords of one length."""
     keep = sane(stream, np.s_[-3:])
     v = stream.rows[keep, -3:] if len(keep) else np.zeros((0, 3))
-    chords, mean = _pairs(stream.stamps_ns[keep], v, stamps_ns, p_m, chord_s)
-    noise = 2.0 * scatter_m / chord_s  # of a chord between two places, both axes together, m/s
+    chords, mean = _pairs(stream.stamps_ns[keep], v, reference, chord_s)
+    noise = 2.0 * reference.scatter_m / chord_s  # of a chord between two places, both axes together, m/s
     forward = chords / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
     # Body x laid along the track, either way: a craft may go astern.
     in_body = mean @ R_body_sensor.T
@@ -92,7 +85,10 @@ def _axes_by(
     if len(chords) < 10 or speed < 0.5:
         return None, "no GNSS track in motion to check it against"
     if noise > speed:
-        return None, f"the fixes scatter by {scatter_m:.1f} m, too much to check it against at {speed:.1f} m/s"
+        return (
+            None,
+            f"the fixes scatter by {reference.scatter_m:.1f} m, too much to check it against at {speed:.1f} m/s",
+        )
     # What lies along the chords has their noise across them, too.
     parts = (1.0, 1.0, 0.5**0.5)
     errors = [_less(float(np.sqrt(own.mean())), part * noise) for own, part in zip(squared, parts, strict=True)]
@@ -128,34 +124,19 @@ def _less(rms: float, noise: float) -> float:
     return float(np.sqrt(max(rms**2 - noise**2, 0.0)))
 
 
-def velocity_report(
-    stream: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, pose: Pose | None, scatter_m: float = 0.0
-) -> VelocityReport:
+def velocity_report(stream: TopicData, reference: ReferenceTrack, pose: Pose | None) -> VelocityReport:
     """Return the axes of a twist or vector: of its frame, if tf has it; else as `axes_of`. Of a Doppler log also the mount.
 
     Args:
-        stream, stamps_ns, p_m, scatter_m: as for `axes_of`. pose: T_body_sensor by tf, which connects its frame with the body.
+        stream, reference: as for `axes_of`. pose: T_body_sensor by tf, which connects its frame with the body.
     """
-    log = stream.part is not None and stream.part.kind == "body_velocity"
+    log = _of_doppler_log(stream)
     R_body_sensor = None if log or pose is None else pose[1]
-    axes, why = axes_of(stream, stamps_ns, p_m, scatter_m, R_body_sensor)
+    axes, why = axes_of(stream, reference, R_body_sensor)
     if axes == "unknown" and R_body_sensor is not None:  # of axes that are not those of tf
         R_body_sensor = None
-        axes, why = axes_of(stream, stamps_ns, p_m, scatter_m)
-    if log:
-        axes, why = BODY_AXES, f"a Doppler log's, by its type; {why}"
-    elif stream.part is not None and stream.part.told:
-        axes, why = EAST_AXES, f"known by its type; {why}"
-    elif stream.part is not None and axes not in (EAST_AXES, NORTH_AXES):
-        axes, why = NORTH_AXES, f"as its driver writes it by default; {why}"
-    if axes == EITHER:
-        axes = EAST_AXES if _OF_GNSS.search(f"{stream.topic} {stream.frame_id}") else BODY_AXES
-        why = f"by the names of its topic and frame; {why}"
-    if axes is None and _OF_LOG.search(f"{stream.topic} {stream.frame_id}"):
-        axes, why = BODY_AXES, f"by the names of its topic and frame; {why}"
-    if of_log(stream.topic) or through_water(stream.topic):
-        past = "through the water" if through_water(stream.topic) else "over ground by a log"
-        axes, why = BODY_AXES, f"a speed {past}; {why}"
+        axes, why = axes_of(stream, reference)
+    axes, why = _axes_by_kind(stream, axes, why)
     turned = axes == BODY_AXES and R_body_sensor is not None and abs(float(R_body_sensor[0, 0])) < _ALONG
     rows = stream.rows[sane(stream)]
     reverse = axes == BODY_AXES and pose is None and len(rows) > 0 and _astern(rows[:, -3])
@@ -173,6 +154,34 @@ def velocity_report(
         if axes == BODY_AXES and R_body_sensor is not None
         else None,
     )
+
+
+def _of_doppler_log(stream: TopicData) -> bool:
+    return stream.part is not None and stream.part.kind == "body_velocity"
+
+
+def _axes_by_kind(stream: TopicData, axes: str | None, why: str) -> tuple[str | None, str]:
+    """Return the axes, and why, that the type of a velocity, its names or its sentence tell, or else the track.
+
+    Args:
+        axes, why: by the track, see `axes_of`.
+    """
+    part, names = stream.part, f"{stream.topic} {stream.frame_id}"
+    if _of_doppler_log(stream):
+        axes, why = BODY_AXES, f"a Doppler log's, by its type; {why}"
+    elif part is not None and part.told:
+        axes, why = EAST_AXES, f"known by its type; {why}"
+    elif part is not None and axes not in (EAST_AXES, NORTH_AXES):
+        axes, why = NORTH_AXES, f"as its driver writes it by default; {why}"
+    elif axes == EITHER:
+        axes = EAST_AXES if _OF_GNSS.search(names) else BODY_AXES
+        why = f"by the names of its topic and frame; {why}"
+    elif axes is None and _OF_LOG.search(names):
+        axes, why = BODY_AXES, f"by the names of its topic and frame; {why}"
+    if of_log(stream.topic) or through_water(stream.topic):
+        past = "through the water" if through_water(stream.topic) else "over ground by a log"
+        axes, why = BODY_AXES, f"a speed {past}; {why}"
+    return axes, why
 
 
 def _mount_of_log(frame: str, pose: Pose | None, reverse: bool) -> MountGuess:
@@ -198,13 +207,11 @@ def _astern(forward_mps: Array) -> bool:
     return bool(moves.sum() >= _FEWEST and (forward_mps[moves] < 0.0).mean() > _ASTERN)
 
 
-def odometry_report(
-    stream: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, world: World, scatter_m: float = 0.0
-) -> OdometryReport:
+def odometry_report(stream: TopicData, reference: ReferenceTrack, world: World) -> OdometryReport:
     """Return the likely role of an odometry or pose topic, by its name and whether it reports the speed of the vessel.
 
     Args:
-        world: its frame, by `world_of`; else as `axes_of`.
+        reference: as for `axes_of`. world: its frame, by `world_of`.
     """
     rows = stream.rows[sane(stream)]
     speed = float(np.nanmax(np.abs(rows[:, 7]))) if len(rows) and np.isfinite(rows[:, 7]).any() else 0.0
@@ -215,7 +222,7 @@ def odometry_report(
     elif stream.msgtype != ODOMETRY or speed <= 0.05:
         role, why = "pose", "it reports poses and no speed"
     else:
-        axes, fit = axes_of(stream, stamps_ns, p_m, scatter_m)
+        axes, fit = axes_of(stream, reference)
         whose = f"{fused}, no check by other means" if fused else "looks like wheel odometry"
         role, why = "check_speed", f"it reports forward speeds up to {speed:.1f} m/s: {whose}"
         reverse = _astern(rows[:, 7])
@@ -266,20 +273,24 @@ def motions_of(
     logs: list[MeasuredMotion] = []
     found = [m for s in wheels if (m := _told(s, BODY_AXES)) and float(np.ptp(m.speed_mps)) > 0.2]
     for stream, report in twists:
-        if (
-            report.axes == "unknown"
-            or through_water(stream.topic)
-            or (stream.msgtype == VECTOR and report.axes not in (EAST_AXES, NORTH_AXES))
-        ):
-            continue
-        log = report.mount if report.tf_frame is not None else None
-        rpy_deg = report.rpy_deg if log is None else log.rpy_deg
-        R = None if rpy_deg is None else rotation_from_rpy_deg(np.array(rpy_deg))
-        motion = _told(stream, report.axes or EAST_AXES, R)
-        if motion is not None and float(np.percentile(np.abs(motion.speed_mps), 90)) > 0.5:
-            (found if report.mount is None or log is not None else logs).append(motion)
+        motion = _motion_of(stream, report)
+        if motion is not None:
+            (logs if report.mount is not None and report.tf_frame is None else found).append(motion)
     ways = [(s, *_as_good_as_most(*track(s))) for s in fixes]
     return found + [m for s, at, p in ways if (m := motion_of_places(s.topic, at, p))] or logs
+
+
+def _motion_of(stream: TopicData, report: VelocityReport) -> MeasuredMotion | None:
+    """Return the motion by a velocity over ground; None where its axes are not known, or it hardly moves."""
+    known = report.axes in (EAST_AXES, NORTH_AXES) if stream.msgtype == VECTOR else report.axes != "unknown"
+    if not known or through_water(stream.topic):
+        return None
+    log = report.mount if report.tf_frame is not None else None
+    rpy_deg = report.rpy_deg if log is None else log.rpy_deg
+    R = None if rpy_deg is None else rotation_from_rpy_deg(np.array(rpy_deg))
+    motion = _told(stream, report.axes or EAST_AXES, R)
+    fast = motion is not None and float(np.percentile(np.abs(motion.speed_mps), 90)) > 0.5
+    return motion if fast else None
 
 
 def motion_of_poses(poses: TopicData) -> MeasuredMotion | None:
@@ -318,16 +329,14 @@ def _told(stream: TopicData, axes: str, R_body_sensor: Array | None = None) -> M
     return MeasuredMotion(stream.topic, origin, t, np.hypot(east, north), integral(t, east + 1j * north))
 
 
-def _pairs(
-    stamps_ns: NDArray[np.int64], v: Array, track_ns: NDArray[np.int64], p_m: Array, chord_s: float
-) -> tuple[Array, Array]:
+def _pairs(stamps_ns: NDArray[np.int64], v: Array, reference: ReferenceTrack, chord_s: float) -> tuple[Array, Array]:
     """Return the track's mean velocities (M, 2) over some seconds, and the twists' (M, 3) over the same."""
     none = np.zeros((0, 2)), np.zeros((0, 3))
-    if len(stamps_ns) < 10 or len(track_ns) < 3:
+    if len(stamps_ns) < 10 or len(reference.stamps_ns) < 3:
         return none
-    t, at = (stamps_ns - stamps_ns[0]) / NS_PER_S, (track_ns - stamps_ns[0]) / NS_PER_S
+    t, at = (stamps_ns - stamps_ns[0]) / NS_PER_S, (reference.stamps_ns - stamps_ns[0]) / NS_PER_S
     inside = (at >= t[0]) & (at <= t[-1])
-    at, p_m = at[inside], p_m[inside]
+    at, p_m = at[inside], reference.p_m[inside]
     end = np.searchsorted(at, at + chord_s)
     begin = np.flatnonzero(end < len(at))
     end = end[begin]

@@ -6,11 +6,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array, Datum, Geodetic
-from graphloc.frontends._assess import sane, vec
+from graphloc.frontends._assess import ReferenceTrack, sane, vec
 from graphloc.frontends._reports import Vec
 from graphloc.frontends._streams import TopicData
 from graphloc.signals.series import interpolated
@@ -51,14 +50,11 @@ def _middle_m(poses: TopicData) -> Array:
     return np.median(places, axis=0) if len(places) else np.zeros(3)
 
 
-def world_of(
-    poses: TopicData, stamps_ns: NDArray[np.int64], p_m: Array, first_fix: Vec | None, antenna_m: Array | None
-) -> World:
+def world_of(poses: TopicData, fixes: ReferenceTrack, antenna_m: Array | None) -> World:
     """Return the origin of the poses' frame: latitude, longitude, deg, and height, m.
 
     Args:
-        poses: odometry or poses. stamps_ns: (N,) of the fixes. p_m: (N, 3) m about `first_fix`, ENU.
-        antenna_m: (3,) in body, if /tf_static has it.
+        poses: odometry or poses. antenna_m: (3,) in body, if /tf_static has it.
     """
     keep = sane(poses, np.s_[:3])
     away_m = float(np.linalg.norm(_middle_m(poses)))
@@ -67,14 +63,14 @@ def world_of(
         kind = "a map grid (UTM)" if grid else "earth-centred axes, which are not read"
         said = f"it is {away_m / 1e3:.0f} km from its origin: looks like {kind}"
         return World(None, said, pose=False, grid=grid, centred=not grid)
-    if first_fix is None or len(keep) < 10 or len(stamps_ns) < 10:
+    if fixes.first is None or len(keep) < 10 or len(fixes.stamps_ns) < 10:
         return World(None, "no GNSS track to check its frame against")
     at, q = poses.stamps_ns[keep], poses.rows[keep, :3]
     if antenna_m is not None:  # the antenna by the poses' own attitude
         q = q + Rotation.from_quat(_quaternions(poses.rows[keep, 3:7])).apply(antenna_m)
-    inside = (stamps_ns >= at[0]) & (stamps_ns <= at[-1])
-    t, there = (at - at[0]) / NS_PER_S, (stamps_ns[inside] - at[0]) / NS_PER_S
-    p, q = p_m[inside], interpolated(there, t, q)
+    inside = (fixes.stamps_ns >= at[0]) & (fixes.stamps_ns <= at[-1])
+    t, there = (at - at[0]) / NS_PER_S, (fixes.stamps_ns[inside] - at[0]) / NS_PER_S
+    p, q = fixes.p_m[inside], interpolated(there, t, q)
     extent = float(np.hypot(*np.ptp(p[:, :2], axis=0))) if len(p) else 0.0
     if len(p) < 10 or extent < _EXTENT_M:
         return World(None, f"the GNSS track is too short ({extent:.0f} m) to check its frame against")
@@ -102,7 +98,7 @@ def world_of(
         return World(
             None, f"its frame is not east-north-up: turned by {turned:+.1f} deg, {apart:.1f} m apart from the fixes"
         )
-    place = Datum(Geodetic(*first_fix)).geodetic_from_enu(offset[None, :])[0]
+    place = Datum(Geodetic(*fixes.first)).geodetic_from_enu(offset[None, :])[0]
     lever = "" if antenna_m is not None else " and the antenna's unknown lever arm"
     return World(
         vec(place),

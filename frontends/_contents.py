@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, NamedTuple
@@ -23,6 +23,7 @@ from graphloc.frontends._clock import (
     usual_latency_s,
     without_leaps,
 )
+from graphloc.frontends._reports import bare_topic
 from graphloc.frontends._streams import Sentences, TopicData, read_streams
 from graphloc.frontends._tf import Pose, StaticTree
 from graphloc.frontends.aerial.cloud import CLOUDS
@@ -88,54 +89,71 @@ def contents_of(bags: Bags | Bag) -> Contents:
         InputError: the bag cannot be opened, or its parts overlap in time.
     """
     with unopened(bags) as bag:
-        topics = bag.topics
-        bag.refuse_set_back([t.topic for t in topics.values() if IMU in t.msgtypes])
+        bag.refuse_set_back([t.topic for t in bag.topics.values() if IMU in t.msgtypes])
         streams, tree, sentences = read_streams(bag)
-        lidars = _firsts_of(bag, [t.topic for t in topics.values() if set(CLOUDS) & set(t.msgtypes) and t.messages])
+        lidars = _firsts_of(bag, _topics_of(bag, CLOUDS))
         cameras = _firsts_of(bag, _pictures(bag))
-        infos = _firsts_of(
-            bag, [t.topic for t in topics.values() if INFO in t.msgtypes and t.messages] if cameras else []
-        )
-        source, warnings = bag.name, (*bag.warnings, *([tree.damage] if tree.damage else []))
-    recorder = next((at for s in streams if (at := recorder_set(s.stamps_ns, s.logs_ns))), None)
-    if recorder is not None:
-        warnings += (recorder.said_of_recorder,)
-        streams = [s.logged(steady_logs(s.stamps_ns, s.logs_ns)) for s in streams]
+        infos = _firsts_of(bag, _topics_of(bag, (INFO,))) if cameras else {}
+        source, topics, warnings = bag.name, bag.topics, [*bag.warnings, *filter(None, [tree.damage])]
+    streams, said_of_recorder = _steadily_recorded(streams)
     streams, said_of_leaps = _without_leaps(streams)
-    warnings += said_of_leaps
     streams = [evenly(s) if s.msgtype == IMU and len(s) else s for s in without_drift(streams)]
     for stream in streams:
         if stream.msgtype == IMU:
             refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)
     steps = _clock_steps(streams)
-    warnings = (*warnings, *(at.said(topic) for topic, at in steps.items()))
-    imu = next((s for s in streams if s.msgtype == IMU and len(s)), None)
-    if imu is not None:
-        said = pauses_warning(common_pauses(np.sort(imu.stamps_ns), (s.stamps_ns for s in streams if s is not imu)))
-        warnings = (*warnings, *([said] if said else []))
+    said_of_steps = [at.said(topic) for topic, at in steps.items()]
     return Contents(
         source=source, topics=topics, streams={s.topic: s for s in streams},
         aligned={s.topic: s for s in on_one_clock([_as_mostly_set(s, steps) for s in streams if len(s)])},
-        tree=tree, sentences=sentences, lidars=lidars, cameras=cameras, infos=infos, warnings=warnings,
+        tree=tree, sentences=sentences, lidars=lidars, cameras=cameras, infos=infos,
+        warnings=(*warnings, *said_of_recorder, *said_of_leaps, *said_of_steps, *_said_of_pauses(streams)),
     )  # fmt: skip
 
 
-def _without_leaps(streams: Sequence[TopicData]) -> tuple[list[TopicData], tuple[str, ...]]:
+def _topics_of(bag: Bag, msgtypes: Iterable[str]) -> list[str]:
+    """Return the topics of some message types that have messages."""
+    kinds = set(msgtypes)
+    return [t.topic for t in bag.topics.values() if kinds & set(t.msgtypes) and t.messages]
+
+
+def _imu_of(streams: Sequence[TopicData]) -> TopicData | None:
+    return next((s for s in streams if s.msgtype == IMU and len(s)), None)
+
+
+def _steadily_recorded(streams: list[TopicData]) -> tuple[list[TopicData], list[str]]:
+    """Return the streams with recording times that run on where the recorder's clock was set, and a line if it was."""
+    recorder = next((at for s in streams if (at := recorder_set(s.stamps_ns, s.logs_ns))), None)
+    if recorder is None:
+        return streams, []
+    return [s.logged(steady_logs(s.stamps_ns, s.logs_ns)) for s in streams], [recorder.said_of_recorder]
+
+
+def _without_leaps(streams: list[TopicData]) -> tuple[list[TopicData], list[str]]:
     """Return the streams with stamps put right as they are when the bag is read (`without_leaps`), and a line for each such topic."""
-    imu = next((s for s in streams if s.msgtype == IMU and len(s)), None)
+    imu = _imu_of(streams)
     if imu is None or leaps(imu.stamps_ns, imu.logs_ns):
-        return list(streams), ()
+        return streams, []
     latency_s = usual_latency_s(imu.stamps_ns, imu.logs_ns)
     right, lines = [], dict[str, str]()
     for stream in streams:
-        topic = stream.topic.partition(" ")[0]
+        topic = bare_topic(stream.topic)
         if not stream.recorded:
             stamps_ns, said = without_leaps(stream.stamps_ns, stream.logs_ns, latency_s, topic)
             if said:
                 stream = stream.stamped(stamps_ns)
                 lines.setdefault(topic, said)
         right.append(stream)
-    return right, tuple(lines.values())
+    return right, list(lines.values())
+
+
+def _said_of_pauses(streams: Sequence[TopicData]) -> list[str]:
+    """Return a line on pauses that all streams have at once, if there are any."""
+    imu = _imu_of(streams)
+    if imu is None:
+        return []
+    said = pauses_warning(common_pauses(np.sort(imu.stamps_ns), (s.stamps_ns for s in streams if s is not imu)))
+    return [said] if said else []
 
 
 def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
@@ -143,7 +161,7 @@ def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
     stamped = [s for s in streams if len(s) >= FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED]
     steps: dict[str, ClockStep | None] = {}
     for stream in stamped:  # of what comes on one topic, some may come on one side only
-        topic = stream.topic.partition(" ")[0]
+        topic = bare_topic(stream.topic)
         steps[topic] = steps.get(topic) or step(stream.stamps_ns, stream.logs_ns)
     found = {topic: at for topic, at in steps.items() if at is not None}
     sizes = [at.by_s for at in found.values()]
@@ -154,7 +172,7 @@ def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
 
 def _as_mostly_set(stream: TopicData, steps: Mapping[str, ClockStep]) -> TopicData:
     """Return the stream with the stamps of before, or after, its clock was set moved to where most are: else it contradicts itself."""
-    at = steps.get(stream.topic.partition(" ")[0])
+    at = steps.get(bare_topic(stream.topic))
     if at is None or stream.recorded:
         return stream
     after = stream.logs_ns >= at.at_ns
@@ -164,8 +182,7 @@ def _as_mostly_set(stream: TopicData, steps: Mapping[str, ClockStep]) -> TopicDa
 
 def _pictures(bag: Bag) -> list[str]:
     """Return the topics of images and tag lists; of a camera that has both kinds of images, the compressed one; no depth images."""
-    kinds = (*IMAGES, *LISTS)
-    every = [t.topic for t in bag.topics.values() if set(kinds) & set(t.msgtypes) and t.messages]
+    every = _topics_of(bag, (*IMAGES, *LISTS))
     return [t for t in every if f"{t}/compressed" not in every and "depth" not in t.lower()]
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from graphloc.frontends._clock import (
     EPOCH_LIMIT_S,
@@ -21,8 +22,8 @@ from graphloc.frontends._reports import (
     Inspection,
     MountedTopic,
     TopicReport,
-    Vec,
     VelocityReport,
+    bare_topic,
 )
 from graphloc.frontends.decode import UNSTAMPED
 from graphloc.time import GPS_AHEAD_S
@@ -51,7 +52,7 @@ def with_clock(block: list[str], inspection: Inspection) -> list[str]:
 
 def _by_topic(inspection: Inspection) -> dict[str, TopicReport]:
     """Return the reports by topic, the last of those that share it: of NMEA a report is of a sentence."""
-    return {t.topic.partition(" ")[0]: t for t in inspection.topics}
+    return {bare_topic(t.topic): t for t in inspection.topics}
 
 
 def _value(block: list[str], key: str) -> str:
@@ -80,72 +81,101 @@ def _drift_lines(own: TopicReport) -> list[str]:
     return [f"  clock_drift_ppm: {ppm:.1f}  # guess: {said}"]
 
 
+class _Told(NamedTuple):
+    """What something tells of the stamps of a sensor: what to add to them, s, 1 sigma of what is left, s, and how it tells that."""
+
+    by_s: float
+    sigma_s: float
+    why: str
+
+
 def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], inspection: Inspection) -> list[str]:
     """Say what to add to the stamps: where a clock is off by the recording times, or stamps are late by the motion."""
-    found_behind = _behind(topic, topics, inspection) if kind in _SET else None
-    if found_behind is None:
+    behind = _behind(topic, topics, inspection) if kind in _SET else None
+    if behind is None:
         return []
-    behind, clock = found_behind
-    told: dict[str, Sequence[GnssReport | VelocityReport | CompassReport]] = {
+    by_motion = _by_motion(kind, topic, inspection)
+    told = [*_by_recording_times(kind, *behind), *by_motion] or _by_sentences(kind, topic, inspection)
+    lines = []
+    if told:
+        lines.append(f"  time_offset_s: {sum(t.by_s for t in told):.3f}  # guess: {'; '.join(t.why for t in told)}")
+    fixes_late_s = next((r.late_s[0] for r in inspection.gnss if r.late_s), 0.0)
+    if kind == "gnss_velocity" and by_motion and by_motion[0].by_s < fixes_late_s - MOST_ON_ITS_WAY_S:
+        lines.append(
+            f"  min_sigma_mps: {_FILTERED_SIGMA_MPS}  # guess: so late, it is filtered, and its errors are correlated"
+        )
+    return [*lines, _sigma_line(topics[topic], told, _hinted(topic, inspection))] if kind in _ESTIMATED else lines
+
+
+def _sigma_line(own: TopicReport, told: Sequence[_Told], hinted: tuple[float, float] | None) -> str:
+    """Say how well the delay is known before the run."""
+    unstamped = own.recorded or own.msgtype in UNSTAMPED
+    sigma_s, said = _ON_ITS_WAY_S if unstamped else _STAMPED_LATE_S, ""
+    if told:
+        sigma_s = told[-1].sigma_s
+    if hinted:
+        sigma_s = max(sigma_s, abs(hinted[0]))
+        said = f"; what the IMU feels hints at {hinted[0]:+.2f} +- {hinted[1]:.2f} s, not clearly"
+    return f"  stamp_sigma_s: {sigma_s:.2f}  # guess: {_STAMPS}{said}"
+
+
+def _hinted(topic: str, inspection: Inspection) -> tuple[float, float] | None:
+    """Return what the IMU hints at that the stamps of a topic of fixes are late by, s, and 1 sigma."""
+    return next((r.hinted_s for r in inspection.gnss if bare_topic(r.topic) == topic and r.hinted_s), None)
+
+
+def _by_recording_times(kind: str, behind_s: float, clock: str) -> list[_Told]:
+    if abs(behind_s) <= EPOCH_LIMIT_S:
+        return []
+    why = (
+        f"its clock is {'behind' if behind_s > 0 else 'ahead of'} {clock}, by the recording times; that includes the "
+        f"difference of their transport delays{'' if kind in _ESTIMATED else ', which no bound includes'}"
+    )
+    return [_Told(behind_s, _ON_ITS_WAY_S, why)]
+
+
+def _by_motion(kind: str, topic: str, inspection: Inspection) -> list[_Told]:
+    """Return how late the stamps of a topic are by its motion, or turns; none where these do not tell."""
+    reports: dict[str, Sequence[GnssReport | VelocityReport | CompassReport]] = {
         "gnss": inspection.gnss,
         "gnss_velocity": inspection.velocities,
         "compass": inspection.compasses,
     }
-    found = next((r for r in told.get(kind, ()) if r.topic.partition(" ")[0] == topic and r.late_s), None)
-    late = found.late_s if found else None
-    unstamped = topics[topic].recorded or topics[topic].msgtype in UNSTAMPED
-    offset_s, why, sigma_s = 0.0, [], _ON_ITS_WAY_S if unstamped else _STAMPED_LATE_S
-    if abs(behind) > EPOCH_LIMIT_S:
-        offset_s, sigma_s = offset_s + behind, _ON_ITS_WAY_S
-        why.append(
-            f"its clock is {'behind' if behind > 0 else 'ahead of'} {clock}, by the recording times; that includes the "
-            f"difference of their transport delays{'' if kind in _ESTIMATED else ', which no bound includes'}"
-        )
-    if late is not None:
-        offset_s, sigma_s = offset_s + late[0], max(late[1], _STAMPED_LATE_S)
-        by = found.late_by if isinstance(found, GnssReport) and found.late_by.partition(" ")[0] != topic else ""
-        whose = f"the motion of {by}, taken for the same receiver's," if by else "its motion"
-        fits = "its turns fit the gyro's" if kind == "compass" else f"what the IMU feels fits {whose}"
-        if not isinstance(found, GnssReport | None) and found.late_with_fixes:
-            fits = FITS_WITH_FIXES
-        why.append(f"{fits} {late[0]:+.2f} +- {late[1]:.2f} s from its stamps")
-    after = _after(kind, topic, inspection) if not why else None
-    if after is not None:
-        offset_s, sigma_s = -after[1], max(_ON_ITS_WAY_S, 0.5 * after[1])
-        why.append(
-            f"its sentences tell a time {after[1]:.2f} s ({after[0]:.2f} to {after[2]:.2f}) before they are stamped: right if the computer's clock is"
-        )
-    lines = [f"  time_offset_s: {offset_s:.3f}  # guess: {'; '.join(why)}"] if why else []
-    fixes_late_s = next((r.late_s[0] for r in inspection.gnss if r.late_s), 0.0)
-    if kind == "gnss_velocity" and late is not None and late[0] < fixes_late_s - MOST_ON_ITS_WAY_S:
-        lines.append(
-            f"  min_sigma_mps: {_FILTERED_SIGMA_MPS}  # guess: so late, it is filtered, and its errors are correlated"
-        )
-    if kind in _ESTIMATED:
-        hinted = next((r.hinted_s for r in inspection.gnss if r.topic.partition(" ")[0] == topic and r.hinted_s), None)
-        said = (
-            ""
-            if hinted is None
-            else f"; what the IMU feels hints at {hinted[0]:+.2f} +- {hinted[1]:.2f} s, not clearly"
-        )
-        sigma_s = max(sigma_s, abs(hinted[0]) if hinted else 0.0)
-        lines.append(f"  stamp_sigma_s: {sigma_s:.2f}  # guess: {_STAMPS}{said}")
-    return lines
+    for report in reports.get(kind, ()):
+        if bare_topic(report.topic) == topic and report.late_s:
+            late_s, sigma_s = report.late_s
+            why = f"{_fits(report)} {late_s:+.2f} +- {sigma_s:.2f} s from its stamps"
+            return [_Told(late_s, max(sigma_s, _STAMPED_LATE_S), why)]
+    return []
 
 
-def _after(kind: str, topic: str, inspection: Inspection) -> Vec | None:
-    """Return how long after the times that its fixes tell a topic of NMEA is stamped, s; None where that is no delay of messages.
+def _fits(report: GnssReport | VelocityReport | CompassReport) -> str:
+    if not isinstance(report, GnssReport) and report.late_with_fixes:
+        return FITS_WITH_FIXES
+    if isinstance(report, CompassReport):
+        return "its turns fit the gyro's"
+    by = report.late_by if isinstance(report, GnssReport) else ""
+    other = by if bare_topic(by) != bare_topic(report.topic) else ""
+    whose = f"the motion of {other}, taken for the same receiver's," if other else "its motion"
+    return f"what the IMU feels fits {whose}"
+
+
+def _by_sentences(kind: str, topic: str, inspection: Inspection) -> list[_Told]:
+    """Return how long after the times that its fixes tell a topic of NMEA is stamped; none where that is no delay of messages.
 
     A computer's clock that nothing sets may be as far off by chance: what the IMU feels is believed rather, even a hint.
     """
-    told = [t.after_s for t in inspection.topics if t.topic.partition(" ")[0] == topic and t.after_s]
+    told = [t.after_s for t in inspection.topics if bare_topic(t.topic) == topic and t.after_s]
     if kind not in _ESTIMATED or not told:
-        return None
-    after = min(told, key=lambda points: points[2] - points[0])
-    if not _LEAST_AFTER_S <= after[1] <= _MOST_AFTER_S or after[2] - after[0] > _EVEN_S:
-        return None
-    hinted = next((r.hinted_s for r in inspection.gnss if r.topic.partition(" ")[0] == topic and r.hinted_s), None)
-    return None if hinted and abs(hinted[0] + after[1]) > 2.0 * hinted[1] else after
+        return []
+    least, after, most = min(told, key=lambda points: points[2] - points[0])
+    if not _LEAST_AFTER_S <= after <= _MOST_AFTER_S or most - least > _EVEN_S:
+        return []
+    hinted = _hinted(topic, inspection)
+    if hinted and abs(hinted[0] + after) > 2.0 * hinted[1]:
+        return []
+    why = f"its sentences tell a time {after:.2f} s ({least:.2f} to {most:.2f}) before they are stamped: right if the computer's clock is"
+    return [_Told(-after, max(_ON_ITS_WAY_S, 0.5 * after), why)]
 
 
 def clock_lines(inspection: Inspection) -> list[str]:
@@ -154,7 +184,7 @@ def clock_lines(inspection: Inspection) -> list[str]:
     named = [imu.topic for imu in inspection.imus] + [gnss.topic for gnss in inspection.gnss]
     named += [twist.topic for twist in inspection.velocities] + [compass.topic for compass in inspection.compasses]
     lines = []
-    for topic in dict.fromkeys(name.partition(" ")[0] for name in named):
+    for topic in dict.fromkeys(bare_topic(name) for name in named):
         behind, clock = _behind(topic, topics, inspection) or (0.0, "")
         if abs(behind) > EPOCH_LIMIT_S:
             way = "behind" if behind > 0.0 else "ahead of"

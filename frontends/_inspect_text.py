@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import islice
 
 from graphloc.frontends._draft_clock import clock_lines
 from graphloc.frontends._reports import (
     FITS_WITH_FIXES,
+    CompassReport,
     GnssReport,
     ImuReport,
     Inspection,
+    MountedTopic,
     OdometryReport,
     TopicReport,
     of_nmea,
@@ -35,36 +37,47 @@ def render(inspection: Inspection) -> str:
     for gnss in inspection.gnss:
         lines += ["", *_gnss_lines(gnss)]
     for compass in inspection.compasses:
-        verdict = f"fits as a compass ({compass.convention})" if compass.usable else "not usable as a compass"
-        lines += ["", f"{compass.topic}: {verdict}", f"  {compass.why}"]
-        if compass.backwards and not compass.like:
-            lines.append(
-                "  half a turn off the course: drafted as mounted backwards. If the vessel went astern most of the time, that turns every "
-                "heading by half a turn: set its mount's yaw to 0, and turn that of the IMU by 180 where it is by the motion"
-            )
-        if compass.late_s:
-            fits = FITS_WITH_FIXES if compass.late_with_fixes else "its turns fit the gyro's"
-            lines.append("  {} {:+.2f} +- {:.2f} s from its stamps".format(fits, *compass.late_s))
+        lines += ["", *_compass_lines(compass)]
     for twist in inspection.velocities:
         lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
     for item in inspection.odometry:
         lines += ["", f"{item.topic}: {_fate(item)}", f"  {item.why}; {item.world}"]
     counts = {t.topic: t.count for t in inspection.topics}
-    for what, kind, mounted, need in (
-        ("scans", "aerial", inspection.lidars, "a map"),
-        ("images", "apriltag", inspection.cameras, "a survey of tags"),
-    ):
-        if mounted:
-            lines.append("")
-            for m in mounted:
-                counted = f"{m.topic}: {counts[m.topic]} {'lists of tags' if m.listed else what}"
-                lines.append(f"{counted}; left out, {m.left_out}" if m.left_out else counted)
-        if any(not m.left_out for m in mounted):
-            lines.append(f"  read by a sensor of kind {kind}, which the draft has switched off until there is {need}")
+    lines += _mounted_lines(inspection.lidars, counts, "scans", "aerial", "a map")
+    lines += _mounted_lines(inspection.cameras, counts, "images", "apriltag", "a survey of tags")
     if inspection.tf_frames:
         lines += ["", f"frames in tf: {', '.join(inspection.tf_frames)}"]
     lines += [f"warning: {w}" for w in inspection.warnings]
     return "\n".join(lines)
+
+
+def _compass_lines(compass: CompassReport) -> list[str]:
+    verdict = f"fits as a compass ({compass.convention})" if compass.usable else "not usable as a compass"
+    lines = [f"{compass.topic}: {verdict}", f"  {compass.why}"]
+    if compass.backwards and not compass.like:
+        lines.append(
+            "  half a turn off the course: drafted as mounted backwards. If the vessel went astern most of the time, that turns every "
+            "heading by half a turn: set its mount's yaw to 0, and turn that of the IMU by 180 where it is by the motion"
+        )
+    if compass.late_s:
+        fits = FITS_WITH_FIXES if compass.late_with_fixes else "its turns fit the gyro's"
+        lines.append("  {} {:+.2f} +- {:.2f} s from its stamps".format(fits, *compass.late_s))
+    return lines
+
+
+def _mounted_lines(
+    mounted: Sequence[MountedTopic], counts: Mapping[str, int], what: str, kind: str, need: str
+) -> list[str]:
+    """Return what there is of LiDARs or cameras: how many messages, of `what`, and what a sensor of that `kind` needs to read them."""
+    if not mounted:
+        return []
+    lines = [""]
+    for m in mounted:
+        counted = f"{m.topic}: {counts[m.topic]} {'lists of tags' if m.listed else what}"
+        lines.append(f"{counted}; left out, {m.left_out}" if m.left_out else counted)
+    if any(not m.left_out for m in mounted):
+        lines.append(f"  read by a sensor of kind {kind}, which the draft has switched off until there is {need}")
+    return lines
 
 
 def _fate(item: OdometryReport) -> str:

@@ -181,64 +181,6 @@ def _drop(readings: Readings, bad: NDArray[np.bool_], rejection: Rejection, warn
     return rows
 
 
-def clock_warnings(sensors: Sequence[Readings]) -> tuple[list[str], tuple[str, ...]]:
-    """Return a line for each sensor whose clock differs from that of the IMU (or, without one, of the first sensor).
-
-    Where a clock was set during the run, a line on that instead, for all whom it concerns: if it is the IMU's, all others. And of these lines
-    those that make all poses doubtful, as no bound includes what they say.
-    """
-    told = [r for r in sensors if r.stamps_ns]
-    if len(told) < 2:
-        return [], ()
-    reference = next((r for r in told if r.config.kind == "imu"), told[0])
-    logs = {r.sensor: _clock.steady_logs(r.stamps(), r.logs()) for r in told}
-    gains = {r.sensor: _clock.gain(r.stamps(), logs[r.sensor]) for r in told}
-    usual, usual_s = gains[reference.sensor], _clock.usual_latency_s(reference.stamps(), logs[reference.sensor])
-    steps = {r.sensor: _clock.step(r.stamps(), logs[r.sensor]) for r in told}
-    stepped: dict[str, list[str]] = {}
-    lines, doubts = list[str](), list[str]()
-    if (recorder := _clock.recorder_set(reference.stamps(), reference.logs())) is not None:
-        lines.append(recorder.said_of_recorder)
-    for r in told:
-        own, behind = gains[r.sensor], _clock.usual_latency_s(r.stamps(), logs[r.sensor]) - usual_s
-        gain_s, drift_ppm = own.gained_s - usual.gained_s, own.drift_ppm - usual.drift_ppm
-        whose = r.sensor if steps[r.sensor] else reference.sensor
-        if abs(gain_s) > _clock.GAIN_LIMIT_S and (step := steps[whose]) is not None:
-            stepped.setdefault(step.said(whose), []).append(r.sensor)
-            continue
-        now_s = r.config.time_offset_s
-        set_s = now_s - reference.config.time_offset_s
-        meant = abs(behind + set_s) <= _clock.EPOCH_LIMIT_S and abs(set_s) <= _clock.MOST_LATE_S
-        if abs(behind) > _clock.EPOCH_LIMIT_S and not meant:
-            lines.append(
-                f"{r.sensor}: its clock is {abs(behind):.3f} s {'behind' if behind > 0 else 'ahead of'} that of "
-                f"{reference.sensor}, by the recording times; if that is right, set its time_offset_s to {now_s + behind:.3f}"
-                f"{f' instead of {now_s:g}' if now_s else ''} (that includes the difference of their transport delays)"
-            )
-        if abs(gain_s) > _clock.GAIN_LIMIT_S:
-            cure = "synchronise the clocks, or smooth short parts (--start, --duration)"
-            when = next(
-                (
-                    at.when
-                    for s in (r, reference)
-                    if (at := _clock.step(s.stamps(), logs[s.sensor], _clock.GAIN_LIMIT_S))
-                ),
-                "",
-            )
-            if when:
-                when, cure = f", {when}", "take one side (--start, --duration), or synchronise the clocks"
-            elif own.even and usual.even and drift_ppm:
-                cure = f"set its clock_drift_ppm to {r.config.clock_drift_ppm + drift_ppm:.1f}"
-            lines.append(
-                f"{r.sensor}: its clock {'gains' if gain_s > 0 else 'loses'} {abs(gain_s):.2f} s on that of {reference.sensor} "
-                f"during the run, by the recording times{when}: no time_offset_s holds throughout, and no bound includes it; {cure}"
-            )
-            if abs(gain_s) > max(_clock.SCANS_AHEAD_S, 2.0 * getattr(r.config, "stamp_sigma_s", 0.0)):
-                doubts.append(lines[-1])
-    set_lines = [f"{', '.join(names)}: {said}" for said, names in stepped.items()]
-    return [*set_lines, *lines], (*set_lines, *doubts)
-
-
 def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | None, list[LedgerRow]]:
     """Return the samples in strictly increasing time, late ones in their places, and rows of the messages that are not used.
 

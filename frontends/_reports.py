@@ -32,6 +32,11 @@ FILTER = " (of a filter)"
 EAST_AXES, NORTH_AXES, BODY_AXES = "east, north, up", "north, east, down", "forward, left, up (body)"
 
 
+def bare_topic(name: str) -> str:
+    """Return the topic of a stream by its name, without the sentence of NMEA, or the kind of message, that the stream is of."""
+    return name.partition(" ")[0]
+
+
 def two_antennas(topic: str) -> bool:
     """Return whether a heading is one of GNSS, by the name of its topic or its sentence."""
     return bool(_TWO_ANTENNAS.search(topic)) and not filtered(topic)
@@ -367,6 +372,11 @@ class Inspection:
         poses = any(o.role == "pose" or o.grid for o in self.odometry)
         compasses = any(c.usable for c in self.compasses)
         return bool(self.imus or self.gnss or compasses or poses or self.velocities or self.lidars or self.cameras)
+
+    @property
+    def in_a_grid(self) -> tuple[OdometryReport, ...]:
+        """Positions in a map grid that stand for fixes, where no receiver tells a latitude."""
+        return () if self.gnss else tuple(item for item in self.odometry if item.grid)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain data for JSON; numbers that are not finite become None."""

@@ -17,7 +17,7 @@ from graphloc.errors import in_one_line
 from graphloc.frames import Array
 from graphloc.frontends import nmea
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends._reports import FILTER, WATER
+from graphloc.frontends._reports import FILTER, WATER, bare_topic
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._vendor_said import Part, Said, SaidAlong, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
 from graphloc.frontends.decode import (
@@ -490,7 +490,7 @@ def _take_turns(logs_ns: Sequence[NDArray[np.int64]]) -> bool:
 
 def _told_elsewhere(stream: TopicData, streams: Mapping[str, TopicData]) -> bool:
     """Whether what is said beside a place is nothing, or what VTG on the same line says as well, and about as often."""
-    line, least = stream.topic.partition(" ")[0], _AS_OFTEN * _told(stream)
+    line, least = bare_topic(stream.topic), _AS_OFTEN * _told(stream)
     vtg = any(name.startswith(f"{line} ") and name.endswith("VTG") and _told(s) >= least for name, s in streams.items())
     return vtg or not np.nan_to_num(stream.rows).any()
 

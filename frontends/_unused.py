@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Topics of IMUs, receivers, magnetometers and speeds in a bag that are not used, with reasons."""
+"""What a bag lacks, and topics of IMUs, receivers, magnetometers and speeds in it that are not used, with reasons."""
 
 from __future__ import annotations
 
@@ -10,17 +10,58 @@ import numpy as np
 
 from graphloc.frontends._assess import sane
 from graphloc.frontends._assess_imu import samples_of
+from graphloc.frontends._contents import Contents
 from graphloc.frontends._reader import either
+from graphloc.frontends._reports import GnssReport, ImuReport, OdometryReport, bare_topic
 from graphloc.frontends._streams import TopicData
-from graphloc.frontends.decode import GPS_FIXES, IMU, NAV_SAT_FIX, NUMBERS
+from graphloc.frontends.decode import FIX_TYPES, IMU, NMEA, NUMBERS
 from graphloc.frontends.source import TopicSummary
 
-_FIXES = (NAV_SAT_FIX, *GPS_FIXES)
+_KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
+_MOST_NAMED = 6
 _MAGNETIC = "sensor_msgs/msg/MagneticField"
 # Packets and clouds in a maker's own types, and scans of a plane; lists of tags other than `LISTS`.
 _LIDAR = re.compile(r"LaserScan|livox|velodyne|ouster|pandar|hesai|rslidar|robosense|lidar", re.IGNORECASE)
 _TAGS = re.compile(r"april|aruco|fiducial|CompressedVideo|FFMPEGPacket|theora", re.IGNORECASE)
 _SPEED = re.compile(r"speed|stw|sog|knots|velocity", re.IGNORECASE)
+
+
+def lacking(
+    bag: Contents, imus: Sequence[ImuReport], gnss: Sequence[GnssReport], odometry: Sequence[OdometryReport]
+) -> list[str]:
+    """Say which required sensors are missing, and then also which topics have an unsupported type: they may be it."""
+    poses = [report.topic for report in odometry if report.role == "pose"]
+    placed = gnss or bag.cameras or any(report.grid for report in odometry)
+    lines = []
+    if poses and not placed:
+        said = f"nothing but poses tells the place ({', '.join(poses)}), and the draft has them switched off"
+        which = " of the one that is of this vessel" if len(poses) > 1 else ""
+        lines.append(
+            f"{said}: set enabled: true{which}, and datum: where their origin lies (any place will do for a track in their own frame)"
+        )
+    if all(imu.missing for imu in imus):
+        lines.append("no whole IMU in it: smooth, replay and compare need one (sensor_msgs/Imu, 50 Hz or more)")
+    if not poses and not placed:
+        around = " (scans are matched around a track, which they cannot begin)" if bag.lidars else ""
+        said = "nothing in it tells the place: no GNSS fix that can be used, no pose, no camera for tags"
+        lines.append(f"{said}; smooth, replay and compare need one: record it, too{around}")
+    return [*lines, *_of_other_types(bag)] if lines else []
+
+
+def _of_other_types(bag: Contents) -> list[str]:
+    """Return a line on the topics of types that are neither read here nor known for something else."""
+    read = {
+        *(bare_topic(name) for name in bag.streams),
+        *bag.lidars,
+        *bag.cameras,
+    }  # of NMEA a stream is a sentence
+    others = [
+        f"{t.topic} ({' or '.join(t.msgtypes).replace('/msg/', '/')})"
+        for t in bag.topics.values()
+        if t.topic not in read and t.msgtypes[0] not in NMEA and not _KNOWN.match(t.msgtypes[0])
+    ]
+    more = ", ..." if len(others) > _MOST_NAMED else ""
+    return [f"of no type that is read here: {', '.join(others[:_MOST_NAMED])}{more}"] if others else []
 
 
 def unused_topics(streams: Sequence[TopicData], used: Container[str]) -> list[str]:
@@ -31,7 +72,7 @@ def unused_topics(streams: Sequence[TopicData], used: Container[str]) -> list[st
         else ["the bag holds no message of a known type, or no sentence of NMEA that is read"]
     )
     for stream in streams:
-        if stream.topic in used or stream.msgtype not in (IMU, *_FIXES):
+        if stream.topic in used or stream.msgtype not in (IMU, *FIX_TYPES):
             continue
         total = len(stream) + stream.undecodable + stream.no_stamp
         why = _why_unused(stream)
@@ -96,7 +137,7 @@ def _why_unused(stream: TopicData) -> str:
         "have no stamp": stream.no_stamp,
         "have a stamp that repeats, runs backwards or is far from the recording time": len(stream) - len(rows),
     }
-    if stream.msgtype in _FIXES:
+    if stream.msgtype in FIX_TYPES:
         fix = rows[:, 3] >= 0
         beyond = int((fix & (np.abs(rows[:, 0]) > 90.0)).sum())
         counts |= {

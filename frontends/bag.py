@@ -27,12 +27,12 @@ from graphloc.errors import InputError
 from graphloc.frames import Array, rpy_from_rotation, wrap_angle
 from graphloc.frontends._assess import MeasuredMotion, courses_of_fixes, motion_of_fixes
 from graphloc.frontends._clock import ScanClock, corrected_ns, usual_latency_s
+from graphloc.frontends._clocks import clock_warnings
 from graphloc.frontends._exchanged import exchanged_warnings
 from graphloc.frontends._mount_yaw import yaw_in_craft
 from graphloc.frontends._reader import Reader, either
 from graphloc.frontends._readings import (
     Readings,
-    clock_warnings,
     imu_series,
     judge_fixes,
     reject_far,

@@ -62,6 +62,7 @@ PLACES = (POSE, PLAIN_POSE, TRANSFORM, POINT)
 POSE_TYPES = (ODOMETRY, *PLACES)
 TRUE_TYPES = tuple(t for t in POSE_TYPES if t != POINT)
 GPS_FIXES = ("gps_msgs/msg/GPSFix", "gps_common/msg/GPSFix")
+FIX_TYPES = (NAV_SAT_FIX, *GPS_FIXES)
 NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
 _STRING = "std_msgs/msg/String"
 NMEA = ("nmea_msgs/msg/Sentence", _STRING)

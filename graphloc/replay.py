@@ -11,7 +11,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -226,7 +227,14 @@ def _result(session: _Session, recording: Recording, config: VesselConfig, *, in
             for m in arrivals(recording)
             if m.seq >= 0 and m.seq not in fed
         ]
-    solution = _solution(estimates, Ledger(rows), session.smoother, events, config, _false_of(recording, config))
+    ledger = Ledger(rows)
+    warnings = [event.text for event in events if event.warns]
+    warnings += _rejection_warnings(ledger, config, _false_of(recording, config))
+    stats = SolveStats(
+        passes=0, iterations=len(estimates), states=0, factors=0, cost=0.0, expected_cost=0.0, converged=True,
+        warnings=tuple(warnings), events=tuple(event.text for event in events), online=True,
+    )  # fmt: skip
+    solution = _solution(estimates, session.smoother, ledger, stats)
     return Replayed(recording=recording, solution=solution, estimates=tuple(estimates), update_s=update_s)
 
 
@@ -280,14 +288,7 @@ def _rejection_warnings(ledger: Ledger, config: VesselConfig, false_of: Mapping[
             yield from joint_rejection_warning(name, stamps_of(rows), weights, false)
 
 
-def _solution(
-    estimates: Sequence[Estimate],
-    ledger: Ledger,
-    smoother: OnlineSmoother,
-    events: Sequence[Event],
-    config: VesselConfig,
-    false_of: Mapping[int, float],
-) -> Solution:
+def _solution(estimates: Sequence[Estimate], smoother: OnlineSmoother, ledger: Ledger, stats: SolveStats) -> Solution:
     """Return the solution of each pose as known at its time; where a restart went back in time, the newer one counts."""
     kept: list[Estimate] = []
     for estimate in estimates:
@@ -295,32 +296,20 @@ def _solution(
             kept.pop()
         kept.append(estimate)
     assert smoother.datum is not None
-    stamps = stamps_of(kept)
-    names = kept[-1].since_agreed_s
-    warnings = [*(event.text for event in events if event.warns), *_rejection_warnings(ledger, config, false_of)]
+
+    def columns(*names: str) -> dict[str, Any]:
+        return {name: np.array([getattr(e, name) for e in kept]) for name in names}
+
     return Solution(
         datum=smoother.datum,
-        trajectory=Trajectory(
-            stamps_ns=stamps,
-            p_world_m=np.array([e.p_world_m for e in kept]),
-            R_world_body=np.array([e.R_world_body for e in kept]),
-            v_world_mps=np.array([e.v_world_mps for e in kept]),
-            cov=np.array([e.cov for e in kept]),
-        ),
-        v_cov=np.array([e.v_cov for e in kept]),
-        accel_bias_mps2=np.array([e.accel_bias_mps2 for e in kept]),
-        gyro_bias_radps=np.array([e.gyro_bias_radps for e in kept]),
-        gyro_radps=np.array([e.gyro_radps for e in kept]),
-        gyro_cov=np.array([e.gyro_cov for e in kept]),
+        trajectory=Trajectory(stamps_ns=stamps_of(kept), **columns("p_world_m", "R_world_body", "v_world_mps", "cov")),
+        **columns("v_cov", "accel_bias_mps2", "gyro_bias_radps", "gyro_radps", "gyro_cov"),
         health=tuple(e.health for e in kept),
         health_reason=tuple(e.reason for e in kept),
-        since_agreed_s={n: np.array([e.since_agreed_s[n] for e in kept]) for n in names},
+        since_agreed_s={n: np.array([e.since_agreed_s[n] for e in kept]) for n in kept[-1].since_agreed_s},
         slow={},
         berths=(),
         ledger=ledger,
         antennas_off_m=smoother.antennas_off_m,
-        stats=SolveStats(
-            passes=0, iterations=len(estimates), states=len(kept), factors=0, cost=0.0, expected_cost=0.0, converged=True,
-            warnings=tuple(warnings), events=tuple(event.text for event in events), online=True,
-        ),
-    )  # fmt: skip
+        stats=replace(stats, states=len(kept)),
+    )

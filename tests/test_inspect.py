@@ -22,6 +22,7 @@ from graphloc.config import (
     parse_config,
 )
 from graphloc.frames import Array, Datum, Geodetic, rotation_from_rpy_deg
+from graphloc.frontends._assess import NO_TRACK, ReferenceTrack
 from graphloc.frontends._assess_velocity import EITHER, axes_of, velocity_report
 from graphloc.frontends._fixes import radians_warning
 from graphloc.frontends._reports import BODY_AXES, EAST_AXES
@@ -509,7 +510,7 @@ def test_a_velocity_is_judged_without_the_noise_of_the_fixes(scatter_m: float, a
     stream = TopicData("/vel", TWIST)
     for stamp, velocity in zip(stamps.tolist(), np.gradient(way, 1.0, axis=0).tolist(), strict=True):
         stream.add(stamp, stamp, tuple(velocity), "run.db3")
-    told, why = axes_of(stream, stamps, way + rng.normal(0.0, scatter_m, way.shape), scatter_m)
+    told, why = axes_of(stream, ReferenceTrack(stamps, way + rng.normal(0.0, scatter_m, way.shape), scatter_m))
     assert (told or "").startswith(axes or "")
     assert (told is None) == (axes is None), why
 
@@ -523,7 +524,7 @@ def test_a_jump_of_the_fixes_hides_no_wheels(jump_m: float) -> None:
     stream = TopicData("/odom", TWIST, "link")
     for stamp in (START_NS + (t * S).astype(np.int64)).tolist():
         stream.add(stamp, stamp, (1.0, 0.0, 0.0), "run.db3")
-    assert axes_of(stream, stream.stamps_ns, way, 0.1)[0] == BODY_AXES
+    assert axes_of(stream, ReferenceTrack(stream.stamps_ns, way, 0.1))[0] == BODY_AXES
 
 
 @pytest.mark.parametrize(
@@ -535,7 +536,7 @@ def test_without_a_track_names_tell_a_speed_along_the_vessel(topic: str, frame: 
     stream = TopicData(topic, TWIST, frame)
     for k in range(100):
         stream.add(START_NS + k * S, START_NS + k * S, (1.0 + 0.01 * (k % 7), 0.0, 0.0), "run.db3")
-    assert velocity_report(stream, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None).axes == axes
+    assert velocity_report(stream, NO_TRACK, None).axes == axes
 
 
 @pytest.mark.parametrize(
@@ -560,12 +561,13 @@ def test_a_way_east_tells_a_velocity_to_the_east_from_a_speed_ahead_if_at_all(
     for stamp, v in zip((START_NS + (t * S).astype(np.int64)).tolist(), speed.tolist(), strict=True):
         said = (v, 0.0) if ahead else (v * np.cos(course), v * np.sin(course))
         stream.add(stamp, stamp, (*(said + 0.05 * rng.normal(size=2)), 0.0), "run.db3")
-    told, why = axes_of(stream, stream.stamps_ns, way + wanders, 0.1)
+    fixes = ReferenceTrack(stream.stamps_ns, way + wanders, 0.1)
+    told, why = axes_of(stream, fixes)
     assert told == axes, why
-    report = velocity_report(stream, stream.stamps_ns, way + wanders, None, 0.1)
+    report = velocity_report(stream, fixes, None)
     assert report.axes == (BODY_AXES if axes == EITHER else axes)
     stream.frame_id = "gps_antenna"
-    report = velocity_report(stream, stream.stamps_ns, way + wanders, None, 0.1)
+    report = velocity_report(stream, fixes, None)
     assert report.axes == (EAST_AXES if axes == EITHER else axes)
 
 

@@ -27,6 +27,7 @@ from graphloc.errors import ConfigError, InputError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
 from graphloc.frontends import nmea
+from graphloc.frontends._assess import NO_TRACK
 from graphloc.frontends._assess_velocity import motions_of, velocity_report
 from graphloc.frontends._contents import contents_of
 from graphloc.frontends._rejections import Rejection
@@ -154,7 +155,7 @@ def test_a_velocity_that_begins_without_a_fix_still_tells_the_motion() -> None:
     for k in range(60):
         speed = (np.nan, np.nan, np.nan) if k < 20 else (0.1 * k, 1.0, 0.0)
         stream.add((1 + k) * S, (1 + k) * S, speed, "run.db3")
-    report = velocity_report(stream, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None)
+    report = velocity_report(stream, NO_TRACK, None)
     (motion,) = motions_of([], [(stream, report)], [])
     assert motion.speed_mps == pytest.approx([np.hypot(0.1 * k, 1.0) for k in range(20, 60)])
 

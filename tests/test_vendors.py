@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, VelocityConfig, VesselConfig, load_config
 from graphloc.frames import wrap_angle
-from graphloc.frontends._assess import Courses
+from graphloc.frontends._assess import NO_TRACK, Courses
 from graphloc.frontends._assess_compass import compass_report
 from graphloc.frontends._assess_velocity import velocity_report
 from graphloc.frontends._rejections import Rejection
@@ -601,7 +601,7 @@ def test_a_receiver_that_says_it_twice_counts_once_and_axes_are_known(tmp_path: 
 def test_without_a_track_a_velocity_has_the_axes_of_its_type(msgtype: str, axes: str) -> None:
     """And no other: what looks like speeds along the vessel is one over ground all the same."""
     stream = TopicData("/vel", TWIST, part=VENDORS[msgtype][0])
-    assert velocity_report(stream, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None).axes == axes
+    assert velocity_report(stream, NO_TRACK, None).axes == axes
 
 
 @pytest.mark.parametrize(

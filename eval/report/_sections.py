@@ -55,31 +55,40 @@ def first_screen(data: ReportData, verdict: RunVerdict) -> str:
 
 
 def _key_numbers(data: ReportData) -> str:
-    """Return the main table, one row per estimate, so that it fits a phone."""
+    """Return the main table, and what must be known of its estimates."""
     found = main_table(data)
     if found is None:
         return ""
     whole, key = found
+    ours, names = data.solution.name, [name for name, _ in whole.rows]
+    said = "" if data.solution.stats.online or len(names) < 2 else _WHOLE.format(name=ours)
+    whys = "".join(note(f"{f.name}: {f.why}.") for f in data.filters if f.why and f.name in names)
+    return _key_table(whole, key, ours) + note(said) + whys
+
+
+def _key_table(whole: Table, key: str, ours: str) -> str:
+    """Return the main table, one row per estimate, so that it fits a phone; `key`: the column by which they are compared with `ours`."""
     values = whole.as_dict()
-    mine = values[data.solution.name][key]
-    columns = [(c, said, digits) for c, said, digits in _KEY if c in whole.columns]
-    columns = [c for c in columns if any(v[c[0]] is not None for v in values.values())]
+    told = {c for c in whole.columns if any(row[c] is not None for row in values.values())}
+    first, *columns = [column for column in _KEY if column[0] in told]
     shares = [(c, said) for c, said in _SHARES if c in whole.columns]
-    head = ["", columns[0][1], "times ours", *(c[1] for c in columns[1:]), *(said for _, said in shares)]
-    rows = []
-    for name, row in values.items():
-        first = row[key]
-        ratio = "" if name == data.solution.name or not mine or first is None else times(first, mine)
-        first_of, *rest = (number(row[c], digits) for c, _, digits in columns)
-        rows.append([name, first_of, ratio, *rest, *(percent(row[c]) for c, _ in shares)])
+    head = ["", first[1], "times ours", *(said for _, said, _ in columns), *(said for _, said in shares)]
+    rows = [
+        [
+            name,
+            number(row[first[0]], first[2]),
+            "" if name == ours else _ratio(row[key], values[ours][key]),
+            *(number(row[c], digits) for c, _, digits in columns),
+            *(percent(row[c]) for c, _ in shares),
+        ]
+        for name, row in values.items()
+    ]
     wide = [k for k, said in enumerate(head) if said in _WIDE]
-    whys = "".join(note(f"{f.name}: {f.why}.") for f in data.filters if f.why and f.name in values)
-    said = "" if data.solution.stats.online or len(values) < 2 else _WHOLE.format(name=data.solution.name)
-    return (
-        table(head, rows, ["ours" if name == data.solution.name else "" for name in values], wide=wide, kind="key")
-        + note(said)
-        + whys
-    )
+    return table(head, rows, ["ours" if name == ours else "" for name in values], wide=wide, kind="key")
+
+
+def _ratio(theirs: float | None, ours: float | None) -> str:
+    return times(theirs, ours) if ours and theirs is not None else ""
 
 
 def warnings_list(data: ReportData) -> str:

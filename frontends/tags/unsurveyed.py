@@ -10,9 +10,9 @@ that is only seen beside tags of one dock is taken to ride on it: p_i, R_i are t
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,13 +148,11 @@ def estimate_tags(
 
 
 def _estimate(own: Sequence[TagView], track: Trajectory, size_m: float | None) -> TagConfig | None:
+    """Return a tag from its views; None where these do not tell well where it is, or how large."""
     ordered = sorted(own, key=lambda v: v.stamp_ns)
     stamps, where = np.unique([v.stamp_ns for v in ordered], return_inverse=True)  # two cameras may see it at once
     at = track.at(stamps)
-    unsaid = np.diag([_TRACK_M**2] * 3 + [_TRACK_RAD**2] * 3)
-    covs = np.broadcast_to(unsaid, (len(ordered), 6, 6)) if at.cov is None else at.cov[where]
-    views = [_View(*each) for each in zip(ordered, at.p_world_m[where], at.R_world_body[where], covs, strict=True)]
-    views = [v for v in views if v.poses]
+    views = [v for v in _along(at, ordered, where) if v.poses]
     if len(views) < _FEWEST:
         return None
     place, size = _placed(views, size_m)
@@ -162,37 +160,63 @@ def _estimate(own: Sequence[TagView], track: Trajectory, size_m: float | None) -
         return None
     for v in views:
         v.doubt_track(size)
-    tried = [v.R @ pose.R for v in views[:: max(1, len(views) // _TRIED)] for pose in v.poses]
-    R0 = min(tried, key=lambda R: sum(min(float(e @ e), 1e4) for e in (v.errors(place, R, size) for v in views)))
-
-    def errors(x: Array) -> Array:
-        R = Rotation.from_rotvec(x[3:6]).as_matrix() @ R0
-        return np.concatenate(
-            [v.errors(x[:3], R, size * float(np.exp(x[6])) if size_m is None else size) for v in views]
-        )
-
-    free = 7 if size_m is None else 6
-    solved = least_squares(errors, np.concatenate([place, np.zeros(free - 3)]), loss="soft_l1", x_scale="jac")
-    misfit = max(2.0 * float(solved.cost) / max(len(solved.fun) - free, 1), 1.0)
-    jacobian = np.asarray(solved.jac)
-    cov = np.linalg.inv(jacobian.T @ jacobian + np.eye(free) * _UNKNOWN**-2) * misfit
-    sigma_m, sigma_rad = float(np.sqrt(cov.diagonal()[:3].max())), float(np.sqrt(cov.diagonal()[3:6].max()))
-    if sigma_m > _WELL_M or sigma_rad > _WELL_RAD or (size_m is None and np.sqrt(cov[6, 6]) > _WELL_SIZE):
+    fit = _refined(views, place, size, sized=size_m is not None)
+    if fit.sigma_m > _WELL_M or fit.sigma_rad > _WELL_RAD or fit.sigma_size > _WELL_SIZE:
         return None
+    sigma_m, sigma_rad = fit.sigma_m, fit.sigma_rad
     if at.cov is not None:  # the track's own error does not average out
         sigma_m = float(np.hypot(sigma_m, np.sqrt(np.median(at.cov[:, :2, :2].trace(axis1=1, axis2=2) / 2.0))))
         sigma_rad = float(np.hypot(sigma_rad, np.sqrt(np.median(at.cov[:, 5, 5]))))
-    R = Rotation.from_rotvec(solved.x[3:6]).as_matrix() @ R0
-    x, y, z = (round(float(v), 3) for v in solved.x[:3])
+    x, y, z = (round(float(v), 3) for v in fit.place)
     return TagConfig(
         id=own[0].number,
         family=own[0].family,  # type: ignore[arg-type]  # one of the detector's
-        size_m=round(size * float(np.exp(solved.x[6])), 4) if size_m is None else size,
+        size_m=round(fit.size_m, 4) if size_m is None else size_m,
         xyz_m=(x, y, z),
-        rpy_deg=_rpy_deg(R),
+        rpy_deg=_rpy_deg(fit.R),
         sigma_m=round(sigma_m, 3),
         sigma_deg=round(float(np.degrees(sigma_rad)), 2),
     )
+
+
+def _along(at: Trajectory, ordered: Sequence[TagView], where: NDArray[np.intp]) -> Iterator[_View]:
+    """Yield the views with their cameras in world; `where`: which pose each has."""
+    unsaid = np.diag([_TRACK_M**2] * 3 + [_TRACK_RAD**2] * 3)
+    for view, k in zip(ordered, where.tolist(), strict=True):
+        yield _View(view, at.p_world_m[k], at.R_world_body[k], unsaid if at.cov is None else at.cov[k])
+
+
+class _Refined(NamedTuple):
+    """A tag by the corners of all views: position (3,), attitude (3, 3), size, and 1 sigma of each; of the size as a share, 0 where it is known."""
+
+    place: Array
+    R: Array
+    size_m: float
+    sigma_m: float
+    sigma_rad: float
+    sigma_size: float
+
+
+def _refined(views: Sequence[_View], place: Array, size_m: float, *, sized: bool) -> _Refined:
+    """Return position, attitude and, unless the tag is `sized`, size, refined from where `place` (3,) and `size_m` are near."""
+    tried = [v.R @ pose.R for v in views[:: max(1, len(views) // _TRIED)] for pose in v.poses]
+    R0 = min(tried, key=lambda R: sum(min(float(e @ e), 1e4) for e in (v.errors(place, R, size_m) for v in views)))
+
+    def tag(x: Array) -> tuple[Array, Array, float]:
+        R = Rotation.from_rotvec(x[3:6]).as_matrix() @ R0
+        return x[:3], R, size_m if sized else size_m * float(np.exp(x[6]))
+
+    def errors(x: Array) -> Array:
+        found = tag(x)
+        return np.concatenate([v.errors(*found) for v in views])
+
+    free = 6 if sized else 7
+    solved = least_squares(errors, np.concatenate([place, np.zeros(free - 3)]), loss="soft_l1", x_scale="jac")
+    misfit = max(2.0 * float(solved.cost) / max(len(solved.fun) - free, 1), 1.0)
+    jacobian = np.asarray(solved.jac)
+    variances = np.linalg.inv(jacobian.T @ jacobian + np.eye(free) * _UNKNOWN**-2).diagonal() * misfit
+    sigma_m, sigma_rad = (float(np.sqrt(own.max())) for own in (variances[:3], variances[3:6]))
+    return _Refined(*tag(solved.x), sigma_m, sigma_rad, 0.0 if sized else float(np.sqrt(variances[6])))
 
 
 def _rpy_deg(R: Array) -> tuple[float, float, float]:

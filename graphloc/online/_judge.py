@@ -9,6 +9,7 @@ judged as a sequence, as the batch solver does, and new ones against the predict
 from __future__ import annotations
 
 import heapq
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count
 
@@ -20,7 +21,7 @@ from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
-from graphloc.online._alternatives import choices
+from graphloc.online._alternatives import Choice, choices
 from graphloc.online._entries import Entries, Entry
 from graphloc.online._imu_doubt import Denials
 from graphloc.online._live import LiveProblem, LiveStream
@@ -274,23 +275,16 @@ class Judge:
             weighed, unplaced = choices(stream, [e.index for e in own], found, cov, held)
             best = weighed[0].modes
             now = tuple(h[0] if h is not None and h[1] >= AGREES else None for h in held)
-            share, steps = np.exp([c.log for c in weighed]), np.array([c.step[:3] for c in weighed])
-            # The mean is moved only where the present choice is the most probable one (else that was tried and rejected), and
-            # not by choices that leave the position undetermined: their share of a step of 100 m is no position that any means.
-            tells = np.array([np.trace(c.cov[:3, :3]) for c in weighed]) < _LOOSE * np.trace(cov[:3, :3])
-            mean = (share * tells) @ steps if best == now else np.zeros(3)
-            around = (share[:, None] * (steps - mean)).T @ (steps - mean)
-            if unplaced:
-                around += sum((p * _more(c.cov, cov) for p, c in zip(share, weighed, strict=True)), np.zeros((3, 3)))
-            if np.trace(around) > _SHOWS * np.trace(cov[:3, :3]):
-                self._others[stream.name] = mean, around
             chosen = frozenset((e.index, mode) for e, mode in zip(own, best, strict=True))
             gains = any(mode is not None and mode != other for mode, other in zip(best, now, strict=True))
-            if not gains or chosen == self._chosen.get(stream.name):
-                return tried > 0
-            self._chosen[stream.name] = chosen
-            self._others.pop(stream.name, None)  # it belonged to the estimate before the trial
-            self._try(stream, own, believing(best, found, attached))
+            if gains and chosen != self._chosen.get(stream.name):
+                self._chosen[stream.name] = chosen
+                self._try(stream, own, believing(best, found, attached))
+                continue
+            mean, around = _spread(weighed, cov, moves=best == now, unplaced=unplaced)
+            if np.trace(around) > _SHOWS * np.trace(cov[:3, :3]):
+                self._others[stream.name] = mean, around
+            return tried > 0
         return True
 
     def _try(self, stream: LiveStream, own: list[Entry], others: list[Verdict]) -> None:
@@ -319,6 +313,24 @@ class Judge:
         """Return minus the log probability of the window, marginalised over all hypotheses of a stream."""
         evidence = log_evidence_of(stream, [e.index for e in own], self._attach(own)[1])
         return self._window.error([e.held for e in own if e.held is not None]) - evidence
+
+
+def _spread(weighed: Sequence[Choice], cov: Array, *, moves: bool, unplaced: bool) -> tuple[Array, Array]:
+    """Return what choices add to the newest position, by their probability: mean (3,), m, and covariance (3, 3).
+
+    Args:
+        weighed: the most probable one first. cov: joint one of the estimate, its newest position first.
+        moves: whether the present choice is the most probable one: only then the mean is moved (else that was tried and rejected), and
+            not by choices that leave the position undetermined: their share of a step of 100 m is no position that any means.
+        unplaced: see `choices`.
+    """
+    share, steps = np.exp([c.log for c in weighed]), np.array([c.step[:3] for c in weighed])
+    tells = np.array([np.trace(c.cov[:3, :3]) for c in weighed]) < _LOOSE * np.trace(cov[:3, :3])
+    mean = (share * tells) @ steps if moves else np.zeros(3)
+    around = (share[:, None] * (steps - mean)).T @ (steps - mean)
+    if unplaced:
+        around += sum((p * _more(c.cov, cov) for p, c in zip(share, weighed, strict=True)), np.zeros((3, 3)))
+    return mean, around
 
 
 def _more(cov: Array, than: Array) -> Array:

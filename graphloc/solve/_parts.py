@@ -8,9 +8,10 @@ bridges the gap (120 s: errors of 4.6 m and 30 deg beside it, where 0.1 m is usu
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from itertools import chain
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ from graphloc.solution import Graded, SlowEstimate, Solution, SolveStats
 from graphloc.solve._legs import Solve, seams, solve_legs
 from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory
+
+_T = TypeVar("_T")
 
 
 def solve_parts(
@@ -108,72 +111,63 @@ def _refused(part: Recording, why: str) -> list[LedgerRow]:
 
 
 def _join(solutions: Sequence[Solution], rows: Sequence[LedgerRow], warnings: Sequence[str]) -> Solution:
+    """Return the solutions of all parts, or legs, as one; `rows`: of the ledger, of no part."""
     tracks = [s.trajectory for s in solutions]
-    trajectory = Trajectory(
-        stamps_ns=np.concatenate([t.stamps_ns for t in tracks]),
-        p_world_m=np.concatenate([t.p_world_m for t in tracks]),
-        R_world_body=np.concatenate([t.R_world_body for t in tracks]),
-        v_world_mps=np.concatenate([t.v_world_mps for t in tracks if t.v_world_mps is not None]),
-        cov=np.concatenate([t.cov for t in tracks if t.cov is not None]),
-    )
-    names = dict.fromkeys(name for s in solutions for name in s.since_agreed_s)
-    since = {
-        name: np.concatenate([s.since_agreed_s.get(name, np.full(len(s.trajectory), np.inf)) for s in solutions])
-        for name in names
-    }
-    slow = {
-        name: _join_slow([s.slow[name] for s in solutions if name in s.slow])
-        for name in dict.fromkeys(n for s in solutions for n in s.slow)
-    }
+    offsets = [s.offsets for s in solutions if s.offsets is not None]
     return Solution(
         datum=solutions[0].datum,
-        trajectory=trajectory,
-        v_cov=np.concatenate([s.v_cov for s in solutions]),
-        accel_bias_mps2=np.concatenate([s.accel_bias_mps2 for s in solutions]),
-        gyro_bias_radps=np.concatenate([s.gyro_bias_radps for s in solutions]),
-        gyro_radps=np.concatenate([s.gyro_radps for s in solutions]),
-        gyro_cov=np.concatenate([s.gyro_cov for s in solutions]),
-        health=tuple(h for s in solutions for h in s.health),
-        health_reason=tuple(r for s in solutions for r in s.health_reason),
-        since_agreed_s=since,
-        slow=slow,
-        berths=tuple(_join_berths([b for s in solutions for b in s.berths])),
+        trajectory=Trajectory(**_columns(tracks, "stamps_ns", "p_world_m", "R_world_body", "v_world_mps", "cov")),
+        **_columns(solutions, "v_cov", "accel_bias_mps2", "gyro_bias_radps", "gyro_radps", "gyro_cov"),
+        health=tuple(chain.from_iterable(s.health for s in solutions)),
+        health_reason=tuple(chain.from_iterable(s.health_reason for s in solutions)),
+        since_agreed_s=_since_agreed(solutions),
+        slow={name: _join_slow(own) for name, own in _by_name([s.slow for s in solutions]).items()},
+        berths=_join_berths([b for s in solutions for b in s.berths]),
         ledger=Ledger([*rows, *(row for s in solutions for row in s.ledger)]),
         stats=_join_stats([s.stats for s in solutions], warnings),
-        offsets=joined(offsets) if (offsets := [s.offsets for s in solutions if s.offsets is not None]) else None,
+        offsets=joined(offsets) if offsets else None,
         time_offsets_s={name: float(by) for name, by in _mean([s.time_offsets_s for s in solutions]).items()},
         antennas_off_m=_mean([s.antennas_off_m for s in solutions]),
     )
 
 
+def _columns(parts: Sequence[object], *names: str) -> dict[str, Any]:
+    """Return the columns of these names, each of all parts that have it, one after another."""
+    return {
+        name: np.concatenate([column for part in parts if (column := getattr(part, name)) is not None])
+        for name in names
+    }
+
+
+def _by_name(parts: Iterable[Mapping[str, _T]]) -> dict[str, list[_T]]:
+    """Return what parts of a run have under each name."""
+    found: dict[str, list[_T]] = {}
+    for name, own in chain.from_iterable(part.items() for part in parts):
+        found.setdefault(name, []).append(own)
+    return found
+
+
 def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[np.float64]]:
     """Return the mean of what parts of a run have found, by name."""
-    names = dict.fromkeys(name for part in parts for name in part)
-    return {name: np.mean([part[name] for part in parts if name in part], axis=0) for name in names}
+    return {name: np.mean(own, axis=0) for name, own in _by_name(parts).items()}
 
 
-def _join_berths(parts: Sequence[BerthTrack]) -> Iterator[BerthTrack]:
-    for name in dict.fromkeys(part.berth.name for part in parts):
-        own = [part for part in parts if part.berth.name == name]
-        yield BerthTrack(
-            berth=own[0].berth,
-            stamps_ns=np.concatenate([part.stamps_ns for part in own]),
-            value=np.concatenate([part.value for part in own]),
-            rate=np.concatenate([part.rate for part in own]),
-            cov=np.concatenate([part.cov for part in own if part.cov is not None]),
-        )
+def _since_agreed(solutions: Sequence[Solution]) -> dict[str, NDArray[np.float64]]:
+    """Return how long each sensor has not agreed, s, by state; never in a part that it does not measure in."""
+    never = [np.full(len(s.trajectory), np.inf) for s in solutions]
+    return {
+        name: np.concatenate([s.since_agreed_s.get(name, none) for s, none in zip(solutions, never, strict=True)])
+        for name in _by_name([s.since_agreed_s for s in solutions])
+    }
+
+
+def _join_berths(parts: Sequence[BerthTrack]) -> tuple[BerthTrack, ...]:
+    alike = _by_name({part.berth.name: part} for part in parts).values()
+    return tuple(BerthTrack(berth=own[0].berth, **_columns(own, "stamps_ns", "value", "rate", "cov")) for own in alike)
 
 
 def _join_slow(parts: Sequence[SlowEstimate]) -> SlowEstimate:
-    def together(name: str) -> NDArray[np.float64]:
-        return np.concatenate([getattr(p, name) for p in parts])
-
-    return replace(
-        parts[0],
-        stamps_ns=np.concatenate([p.stamps_ns for p in parts]),
-        value=together("value"),
-        sigma=together("sigma"),
-    )
+    return replace(parts[0], **_columns(parts, "stamps_ns", "value", "sigma"))
 
 
 def _join_stats(parts: Sequence[SolveStats], warnings: Sequence[str]) -> SolveStats:

@@ -48,30 +48,43 @@ def why_unlikely(sensor: str) -> str:
 
 def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[str]:
     """Why each state cannot be called good; empty where nothing speaks against it."""
-    stamps_ns, why = problem.timeline.stamps_ns, ""
-    if not result.converged:
-        why = "the solver did not converge"
-    elif result.noise_scale > LARGEST_NOISE_SCALE or stats.cost > CONTRADICTING_COST * max(stats.expected_cost, 1.0):
-        why = "the measurements contradict each other"
-    late = (
-        (s.name, late_s / float(s.slow.sigma[s.slow.late or 0]))
-        for s in problem.streams
-        if s.slow is not None and (late_s := late_of(s, result.values)) is not None
-    )
-    why = why or next((why_late(name) for name, off in late if abs(off) > FAR_OFF), "")
-    said = [why] * len(stamps_ns)
-    for stream in problem.streams:
-        if not why and stream.left_out is None and stream.slow is None:  # else the bounds allow for a slow error
-            for at_ns in stream.position_jumps[0]:
-                for k in np.flatnonzero(np.abs(stamps_ns - at_ns) < LASTS_S * 1e9):
-                    said[int(k)] = why_in_doubt(stream.name)
+    if throughout := _misfit_of_run(problem, result, stats):
+        return [throughout] * len(problem.timeline.stamps_ns)
+    said = _beside_jumps(problem)
     receivers: dict[str, list[Stream]] = {}
-    for stream in problem.streams if not why else ():
+    for stream in problem.streams:
         if stream.row.absolute:
             receivers.setdefault(problem.config.receiver_of(stream.name), []).append(stream)
     for by_turns in receivers.values():
         names = _unlikely(problem, by_turns, result.verdicts)
         said = [why_unlikely(name) if name else own for own, name in zip(said, names, strict=True)]
+    return said
+
+
+def _misfit_of_run(problem: Problem, result: BatchResult, stats: SolveStats) -> str:
+    """Return why no state of the run can be called good; empty where nothing says so."""
+    if not result.converged:
+        return "the solver did not converge"
+    if result.noise_scale > LARGEST_NOISE_SCALE or stats.cost > CONTRADICTING_COST * max(stats.expected_cost, 1.0):
+        return "the measurements contradict each other"
+    for stream in problem.streams:
+        late_s = late_of(stream, result.values)
+        if late_s is not None and stream.slow is not None:
+            sigma_s = float(stream.slow.sigma[stream.slow.late or 0])
+            if abs(late_s / sigma_s) > FAR_OFF:
+                return why_late(stream.name)
+    return ""
+
+
+def _beside_jumps(problem: Problem) -> list[str]:
+    """Return why each state is in doubt near a jump of the fixes, whose bounds allow for no slow error; else ''."""
+    stamps_ns = problem.timeline.stamps_ns
+    said = [""] * len(stamps_ns)
+    for stream in problem.streams:
+        if stream.left_out is None and stream.slow is None:
+            for at_ns in stream.position_jumps[0]:
+                for k in np.flatnonzero(np.abs(stamps_ns - at_ns) < LASTS_S * 1e9):
+                    said[int(k)] = why_in_doubt(stream.name)
     return said
 
 

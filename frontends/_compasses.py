@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Headings of a bag, beside the gyroscope of its best IMU: how late they are stamped, how they wander, and which repeat another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from graphloc.frames import wrap_angle
+from graphloc.frontends._assess import Courses
+from graphloc.frontends._assess_compass import compass_report, headings, in_enu, says_the_same
+from graphloc.frontends._assess_imu import Inertial
+from graphloc.frontends._contents import Contents
+from graphloc.frontends._receivers import Late, receiver_of
+from graphloc.frontends._reports import CompassReport, filtered
+from graphloc.frontends._streams import TopicData
+from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
+from graphloc.frontends.decode import IMU, NUMBERS, QUATERNION
+from graphloc.frontends.time_offsets import heading_time_offset
+from graphloc.frontends.turning import Turning
+from graphloc.measurements import CompassHeading, ImuSeries
+from graphloc.time import NS_PER_S
+
+_NONE: Late = {}
+
+
+class _Heading(NamedTuple):
+    """An orientation that may be a heading; `stream`: with the stamps that the report is of."""
+
+    report: CompassReport
+    stream: TopicData
+
+    def same_as(self, other: _Heading) -> bool:
+        mirrored = self.report.convention != other.report.convention
+        return says_the_same(self.stream, other.stream, mirrored=mirrored)
+
+
+def compasses_of(
+    bag: Contents, courses: Courses | None, best: Inertial | None, together: Late = _NONE
+) -> tuple[CompassReport, ...]:
+    """Report every orientation that may be a heading, by the courses and the gyroscope of the best IMU; see `_without_echoes` for their order."""
+    turning = None if best is None else best.felt.turning
+    candidates = bag.of_type(QUATERNION, IMU, *NUMBERS)
+    timed = (_timed(s, courses, turning, together.get(receiver_of(s.topic))) for s in candidates)
+    found = _without_echoes([heading for heading in timed if heading])
+    return tuple(_beside_gyro(heading, best.series) if best else heading.report for heading in found)
+
+
+def _timed(
+    stream: TopicData, courses: Courses | None, turning: Turning | None, fixes_late_s: tuple[float, float] | None
+) -> _Heading | None:
+    """Report an orientation, its stamps corrected by what the gyroscope shows; None where it is no heading.
+
+    Where that shows nothing, by how late the fixes of the same messages are, unless the gyroscope then denies it.
+    """
+    report = compass_report(stream, courses, turning)
+    if report is None:
+        return None
+    as_stamped = _Heading(report, stream)
+    if turning is None or not report.usable:
+        return as_stamped
+    stamps, angle = headings(stream)
+    angle = angle if report.convention == "enu" else -angle
+    own_s = heading_time_offset(turning, stamps, angle)
+    late_s = own_s or fixes_late_s
+    if late_s is None:
+        return as_stamped
+    by_ns = round(late_s[0] * NS_PER_S)
+    if own_s is None and heading_time_offset(turning, stamps + by_ns, angle) is not None:
+        return as_stamped
+    timed = stream.later(by_ns)
+    again = compass_report(timed, courses, turning)
+    if again is None or not again.usable:
+        return as_stamped
+    return _Heading(replace(again, late_s=late_s, late_with_fixes=own_s is None), timed)
+
+
+def _without_echoes(compasses: Sequence[_Heading]) -> list[_Heading]:
+    """Return the compasses, those of types without a stamp, and of filters, last; one that repeats another names it in `like`."""
+    distinct: list[_Heading] = []
+    found = []
+    for report, stream in sorted(compasses, key=lambda h: (filtered(h.report.topic), h.stream.msgtype in NUMBERS)):
+        heading = _Heading(report, stream)
+        like = next((h.report.topic for h in distinct if h.same_as(heading)), "") if report.usable else ""
+        if report.usable and not like:
+            distinct.append(heading)
+        found.append(_Heading(replace(report, like=like), stream))
+    return found
+
+
+def _beside_gyro(heading: _Heading, series: ImuSeries) -> CompassReport:
+    """Return the report with the wander and the number of scattered headings, both relative to the gyroscope of the best IMU."""
+    report, stream = heading
+    if not report.usable:
+        return report
+    stamps, angle = headings(stream)
+    measured = [
+        CompassHeading(stamp_ns=int(s), sensor=stream.topic, seq=0, yaw_rad=float(y), sigma_rad=1.0)
+        for s, y in zip(stamps, wrap_angle(in_enu(angle, report.convention)), strict=True)
+    ]
+    report = replace(report, wander_deg=wander_deg(series, measured))
+    bad = int(scattered(series, measured).sum())
+    return replace(report, why=f"{report.why}; {bad} of {len(measured)}: {SCATTERED}") if bad else report
