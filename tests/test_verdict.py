@@ -13,7 +13,8 @@ from graphloc.eval.ekf import FilterResult
 from graphloc.eval.metrics import Antennas, Table
 from graphloc.eval.report import ReportData, Trust, durations_s, stretches, verdict
 from graphloc.eval.report._health import cure, section
-from graphloc.eval.report._track_verdict import _late_velocity
+from graphloc.eval.report._sections import _key_numbers
+from graphloc.eval.report._track_verdict import _late_velocity, main_table
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import GnssPosition
@@ -145,6 +146,14 @@ def test_a_camera_or_lidar_that_was_left_at_the_guess_is_said(
     assert any(f"at the vessel's origin: {key}.bow of quay" in r.text for r in track.reasons) == said
     (track, _) = verdict(replace(data, config=config, recording=recording)).tracks
     assert not any("cameras" in r.text or "lidars" in r.text for r in track.reasons)  # nothing of it is used
+
+
+def test_a_table_without_any_value_is_no_main_table(data: ReportData) -> None:
+    """The report could not be written."""
+    empty = Table("Against held-out fixes", ("horizontal_rmse_m",), (("graphloc", (None,)), ("BL EKF", (None,))))
+    assert _key_numbers(replace(data, tables=(empty,))) == ""
+    (told,) = table(0.95, 2.0)
+    assert main_table(replace(data, tables=(empty, told))) == (told, "position_rmse_m")
 
 
 @pytest.mark.parametrize(

@@ -392,11 +392,11 @@ def of(data: ReportData, name: str, column: str) -> float | None:
 
 
 def main_table(data: ReportData) -> tuple[Table, str] | None:
-    """Return the first table with an RMSE, and the name of that column."""
+    """Return the first table with an RMSE, of one estimate at least, and the name of that column."""
     for table in data.tables:
-        key = next((k for k in ("position_rmse_m", "horizontal_rmse_m") if k in table.columns), None)
-        if key is not None:
-            return table, key
+        for key in ("position_rmse_m", "horizontal_rmse_m"):
+            if any(row.get(key) is not None for row in table.as_dict().values()):
+                return table, key
     return None
 
 
