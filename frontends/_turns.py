@@ -167,9 +167,9 @@ def _times_turned(imu: ImuSeries, yaws: Yaws) -> float:
 def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | None:
     """Return a compass's wander against the gyroscope, 1 sigma, deg, at a correlation time of a minute; None of a short run.
 
-    Of heading minus integrated rate, a straight line per block (offset, bias) and the parts proportional to heading (deviation),
-    turn (scale) and rate (delay) are removed. If the rest diffuses, its mean square step grows by q t from some seconds to half a
-    minute, on top of white noise. For a first-order Gauss-Markov process, q = 2 sigma^2 / tau.
+    Of heading minus integrated rate, a parabola per block (offset, bias, and what the bias changes by as the IMU warms up) and the parts
+    proportional to heading (deviation), turn (scale) and rate (delay) are removed. If the rest diffuses, its mean square step grows by
+    q t from some seconds to half a minute, on top of white noise. For a first-order Gauss-Markov process, q = 2 sigma^2 / tau.
 
     What is removed takes part of the wander along, in a run of 90 s two thirds of it, which is known and made up for.
 
@@ -183,28 +183,29 @@ def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | No
             continue
         there, count = np.unique(cell, return_counts=True)
         apart = np.unwrap(yaw - turned)
-        columns = [np.ones(len(yaw)), at_s - at_s.mean(), turned, np.gradient(turned, at_s), apart]
+        middle = (at_s - at_s.mean()) / _WANDER_BLOCK_S
+        columns = [np.ones(len(yaw)), middle, middle**2, turned, np.gradient(turned, at_s), apart]
         # The heading by the gyroscope, its bias taken off: by the compass itself, its error would explain itself.
-        along = turned + np.polyval(np.polyfit(at_s - at_s.mean(), apart, 1), at_s - at_s.mean())
+        along = turned + np.polyval(np.polyfit(middle, apart, 2), middle)
         columns += [f(k * along) for k in (1.0, 2.0) for f in (np.sin, np.cos)]
         means = [np.bincount(cell, column)[there] / count for column in columns]
         blocks.append((there, np.column_stack(means)))
     if not blocks:
         return None
     parts = [len(cells) for cells, _ in blocks]
-    common = np.vstack([columns[:, [2, 3, 5, 6, 7, 8]] for _, columns in blocks])
-    lines = block_diag(*(columns[:, :2] for _, columns in blocks))
-    apart, design = np.concatenate([columns[:, 4] for _, columns in blocks]), np.hstack([lines, common])
+    common = np.vstack([columns[:, [3, 4, 6, 7, 8, 9]] for _, columns in blocks])
+    bends = block_diag(*(columns[:, :3] for _, columns in blocks))
+    apart, design = np.concatenate([columns[:, 5] for _, columns in blocks]), np.hstack([bends, common])
     left = np.split(apart - design @ np.linalg.lstsq(design, apart, rcond=1e-6)[0], np.cumsum(parts)[:-1])
     soon, late = (_squared_steps(blocks, left, round(lag_s / _CELL_S)) for lag_s in _LAGS_S)
     grown = max(late - soon, 0.0)
     wander = float(np.degrees(np.sqrt(0.5 * grown / (_LAGS_S[1] - _LAGS_S[0]) * _MINUTE_S)))
     cells = [own for own, _ in blocks]
     by_steps = grown / _grown_of_unit(cells, _left_of_unit(cells, design))
-    # No wander scatters by less about a line than it should; what swings evenly only looks as if much had been taken off.
-    off_line = apart - lines @ np.linalg.lstsq(lines, apart, rcond=1e-6)[0]
-    left_of_unit = np.concatenate([cov.diagonal() for cov in _left_of_unit(cells, lines)])
-    by_spread = float((off_line**2).mean() / left_of_unit.mean())
+    # No wander scatters by less about a parabola than it should; what swings evenly only looks as if much had been taken off.
+    off_bend = apart - bends @ np.linalg.lstsq(bends, apart, rcond=1e-6)[0]
+    left_of_unit = np.concatenate([cov.diagonal() for cov in _left_of_unit(cells, bends)])
+    by_spread = float((off_bend**2).mean() / left_of_unit.mean())
     return max(wander, float(np.degrees(np.sqrt(min(by_steps, by_spread)))))
 
 
