@@ -46,7 +46,8 @@ def render(inspection: Inspection) -> str:
             fits = FITS_WITH_FIXES if compass.late_with_fixes else "its turns fit the gyro's"
             lines.append("  {} {:+.2f} +- {:.2f} s from its stamps".format(fits, *compass.late_s))
     for twist in inspection.velocities:
-        lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
+        lines += ["", f"{twist.topic}: velocity, axes {twist.looks or 'not known'}", f"  {twist.why}"]
+        lines += [f"  {twist.side.said}"] if twist.side else []
     for item in inspection.odometry:
         lines += ["", f"{item.topic}: {_fate(item)}", f"  {item.why}; {item.world}"]
     counts = {t.topic: t.count for t in inspection.topics}

@@ -36,6 +36,7 @@ from graphloc.frontends._clock import usual_latency_s
 from graphloc.frontends._contents import Contents, contents_of
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
+from graphloc.frontends._log_sides import with_side
 from graphloc.frontends._reports import (
     EAST_AXES,
     FILTER,
@@ -156,6 +157,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     taken, imus = imus, [turned_as_its_heading(imu, compasses) for imu in imus]
     if imus and imus[0] is not taken[0]:
         felt = felt_of(bag.aligned[imus[0].topic], imus[0], tree, body)
+    velocities = [(s, with_side(report, s, felt)) for s, report in velocities]
     late = {motion.source: motion_time_offset(felt, motion) for motion in motions} if felt else {}
     used = {g.topic for g in gnss} | {i.topic for i in imus} | {c.topic for c in compasses if c.usable}
     reports = [report for _, report in odometry]
