@@ -208,7 +208,7 @@ def clock_warnings(sensors: Sequence[Readings]) -> tuple[list[str], tuple[str, .
             continue
         now_s = r.config.time_offset_s
         set_s = now_s - reference.config.time_offset_s
-        meant = abs(behind + set_s) <= _clock.EPOCH_LIMIT_S and abs(set_s) <= _clock.MOST_LATE_S
+        meant = abs(behind + set_s) <= _clock.EPOCH_LIMIT_S and abs(set_s) <= _clock.FARTHEST_LATE_S
         if abs(behind) > _clock.EPOCH_LIMIT_S and not meant:
             lines.append(
                 f"{r.sensor}: its clock is {abs(behind):.3f} s {'behind' if behind > 0 else 'ahead of'} that of "

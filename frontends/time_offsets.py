@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 
 from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion
-from graphloc.frontends._clock import MOST_LATE_S, MOST_ON_ITS_WAY_S
+from graphloc.frontends._clock import FARTHEST_LATE_S, MOST_LATE_S, MOST_ON_ITS_WAY_S
 from graphloc.frontends._mount_yaw import FEWEST, MOVES_M, STEP_S, Felt, bent, unbroken, windows_of
 from graphloc.frontends._turns import without_line
 from graphloc.frontends.turning import Turning
@@ -20,9 +20,6 @@ from graphloc.time import NS_PER_S
 
 _BLOCK_S = 20.0  # within which gyroscope bias and deviation hardly change, see `heading_time_offset`
 _CLEAR, _HINT, _LEAST_S = 4.0, 2.0, 0.02  # sigmas, s
-# Of fixes and velocities, whose stamps a radio link or a slow driver makes later than those of others: where the right offset is farther
-# than is looked, a lesser peak of the same motion takes its place, clearly.
-_FARTHEST_S = 3.0
 _BY_CHANCE = 5e-3  # a few blocks that agree by chance look like many
 _APART_S, _LEAST_OF_WAY_S = 0.05, 0.1  # how closely is looked; from which it is said
 _STEPS = 3  # to an offset of a second in the sharpest turns
@@ -119,10 +116,11 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
     if motion.way_m is None:
         return None
     t, at = felt.t_s, felt.times_of(motion)
-    lags = np.arange(-_FARTHEST_S, _FARTHEST_S + 0.5 * _APART_S, _APART_S)
+    # Where the right offset is farther than is looked, a lesser peak of the same motion takes its place, clearly.
+    lags = np.arange(-FARTHEST_LATE_S, FARTHEST_LATE_S + 0.5 * _APART_S, _APART_S)
     found: list[tuple[float, float, float]] = []
     for half_s in windows_of(motion):
-        margin = half_s + _FARTHEST_S
+        margin = half_s + FARTHEST_LATE_S
         middle = np.arange(max(t[0], at[0]) + margin, min(t[-1], at[-1]) - margin, STEP_S)
         moved, chord = bent(at, motion.way_m, middle, half_s)
         good = (np.abs(chord) > MOVES_M) & unbroken(at, middle, half_s)
