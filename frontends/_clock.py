@@ -23,6 +23,8 @@ EPOCH_LIMIT_S = 1.0
 """Clocks of two sensors that differ by more are said to disagree."""
 MOST_LATE_S = 1.5
 """Stamps of a sensor may be off by so much on one clock: a receiver filters its velocity, a driver waits for the rest of a burst."""
+FARTHEST_LATE_S = 3.0
+"""Those of fixes and velocities by so much, where a radio link or a slow driver holds them up: so far the motion is asked."""
 MOST_ON_ITS_WAY_S = 0.6
 """A fix is stamped late by no more if all that delays it is its way to the computer."""
 NO_DATE_NS = 946_684_800 * NS_PER_S

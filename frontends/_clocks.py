@@ -65,7 +65,7 @@ def _epoch_warning(own: _SensorClock, reference: _SensorClock) -> list[str]:
     behind_s = own.latency_s - reference.latency_s
     now_s = own.readings.config.time_offset_s
     set_s = now_s - reference.readings.config.time_offset_s
-    meant = abs(behind_s + set_s) <= _clock.EPOCH_LIMIT_S and abs(set_s) <= _clock.MOST_LATE_S
+    meant = abs(behind_s + set_s) <= _clock.EPOCH_LIMIT_S and abs(set_s) <= _clock.FARTHEST_LATE_S
     if abs(behind_s) <= _clock.EPOCH_LIMIT_S or meant:
         return []
     way = "behind" if behind_s > 0 else "ahead of"

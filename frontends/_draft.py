@@ -185,12 +185,6 @@ def _noise_lines(imu: ImuReport) -> list[str]:
     return lines
 
 
-_UNKNOWN_MOUNT = (
-    "  mount_sigma_m: 1.5  # guess: how far from the mount the place is that does not slip sideways (a car's rear axle); estimated with the run",
-    "  mount_sigma_deg: 1.0  # guess: how far the way they roll is turned; estimated with the run",
-)
-
-
 def _compass_block(name: str, compass: CompassReport, off: str) -> list[str]:
     lines = [
         f"{name}:",

@@ -23,6 +23,7 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._tf import WORLD_NAMES
 from graphloc.frontends.decode import VECTOR
 
+_TO_STARBOARD = "xyz_m: [0.0, 0.0, 0.0], rpy_deg: [180.0, 0.0, 0.0]"
 _UNKNOWN_MOUNT = (
     "  mount_sigma_m: 1.5  # guess: how far from the mount the place is that does not slip sideways (a car's rear axle); estimated with the run",
     "  mount_sigma_deg: 1.0  # guess: how far the way they roll is turned; estimated with the run",
@@ -73,9 +74,19 @@ def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:
             "  axes: [x, y, z]",
             mount_line(twist.mount),
         ]
+    if twist.side:
+        return [
+            *lines,
+            f"  enabled: false  # guess: {fuse}; its axes look {twist.looks}; {twist.why}",
+            f"  axes: [x, y{', z' if twist.rises else ''}]  # guess: {twist.side.said}",
+            f"  mount: {{{frame if twist.side.to_port else _TO_STARBOARD}}}  # {known}",
+            "  mount_sigma_m: 1.0  # guess: how far off that may be: of speeds to the side it counts; estimated with the run; 0 once it is measured",
+            "  mount_sigma_deg: 1.0  # guess: how far its yaw is off; estimated with the run",
+        ]
+    beside = "" if not twist.unsided else "; x alone is read: axes: [x, y, z] reads all, if y looks to port and z up"
     return [
         *lines,
-        f"  enabled: false  # guess: {fuse}; its axes look {twist.axes}; {twist.why}",
+        f"  enabled: false  # guess: {fuse}; its axes look {twist.looks}; {twist.why}{beside}",
         *(["  axes: [x, y]"] if twist.sideways else []),
         f"  mount: {{{frame}}}  # {known}",
     ]  # fmt: skip

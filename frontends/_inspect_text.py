@@ -39,7 +39,8 @@ def render(inspection: Inspection) -> str:
     for compass in inspection.compasses:
         lines += ["", *_compass_lines(compass)]
     for twist in inspection.velocities:
-        lines += ["", f"{twist.topic}: velocity, axes {twist.axes or 'not known'}", f"  {twist.why}"]
+        lines += ["", f"{twist.topic}: velocity, axes {twist.looks or 'not known'}", f"  {twist.why}"]
+        lines += [f"  {twist.side.said}"] if twist.side else []
     for item in inspection.odometry:
         lines += ["", f"{item.topic}: {_fate(item)}", f"  {item.why}; {item.world}"]
     counts = {t.topic: t.count for t in inspection.topics}

@@ -30,6 +30,7 @@ WATER = " (through water)"
 FILTER = " (of a filter)"
 """At the end of the name of a stream whose messages say that a filter made them; see `filtered`."""
 EAST_AXES, NORTH_AXES, BODY_AXES = "east, north, up", "north, east, down", "forward, left, up (body)"
+STARBOARD_AXES, AHEAD = "forward, right, down (body)", "forward (body), and to a side that nothing shows"
 
 
 def bare_topic(name: str) -> str:
@@ -277,13 +278,32 @@ class CompassReport:
         return self.usable and self.offset_deg is not None and abs(self.offset_deg) > _ASTERN_DEG
 
 
+class Side(NamedTuple):
+    """By how much what is felt to the side goes with y of a log, to port: +1, or -1 of one to starboard; 1 sigma."""
+
+    factor: float
+    sigma: float
+
+    @property
+    def to_port(self) -> bool:
+        """Whether y looks to port."""
+        return self.factor > 0.0
+
+    @property
+    def said(self) -> str:
+        """The evidence, in words."""
+        side = "port" if self.to_port else "starboard"
+        return f"y looks to {side}, as what the IMU feels there is {self.factor:+.2f} +- {self.sigma:.2f} times what it says"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VelocityReport:
     """A velocity topic: the axes that fit the GNSS track (unknown: none does; None: nothing to judge by), and why.
 
     `late_s` as of a receiver, `late_with_fixes` as of a compass. `reverse`: it says astern throughout, which is taken for a wrong sign. `mount`: of one whose own axes are known by its type.
     `sideways`: a log's, or that of one which sits turned, that tells its speed to the side, too. `rpy_deg`: how its axes sit by tf, where the
-    track does not deny it.
+    track does not deny it. `side`: which way y looks, where it tells a speed to the side; None: it tells none, or nothing shows which.
+    `rises`: whether it tells a speed up or down, too. `unsided`: whether it tells a speed to a side, and nothing shows which.
     """
 
     topic: str
@@ -298,6 +318,16 @@ class VelocityReport:
     mount: MountGuess | None = None
     sideways: bool = False
     rpy_deg: Vec | None = None
+    side: Side | None = None
+    rises: bool = False
+    unsided: bool = False
+
+    @property
+    def looks(self) -> str | None:
+        """Its axes in words, as far as they are known."""
+        if self.side and not self.side.to_port:
+            return STARBOARD_AXES
+        return AHEAD if self.unsided else self.axes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -33,6 +33,8 @@ WANDERS_DEG = 1.0
 """Of a compass beside the gyroscope: above it there is more than such a comparison errs by."""
 _CELL_S, _WANDER_BLOCK_S, _LONG_BLOCK_S, _LAGS_S, _MINUTE_S = 2.0, 300.0, 60.0, (4.0, 24.0), 60.0
 """Headings are averaged over the first; of blocks as long as the second, changes over the third are compared."""
+_BENDS, _BENDS_S = 0.5, 180.0
+"""Of a wander about a line, below which what is left about a parabola is taken for it; in a run of at least this time, three times that a wander lasts."""
 _SCALE = 1.6  # of the ranges of a gyroscope each is twice the next; a compass in iron turns by a third too much
 Yaws = tuple[NDArray[np.int64], Array]  # stamps (N,), ns, and yaw (N,), rad
 _PART_DEG, _PART = 3.0, 3.0  # least RMS that is said; times the sigma that is claimed
@@ -173,38 +175,51 @@ def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | No
 
     What is removed takes part of the wander along, in a run of 90 s two thirds of it, which is known and made up for.
 
+    A gyroscope that warms up bends what the line is taken off: where a parabola leaves less than half of it, that is the wander. By less, or
+    in a shorter time, a wander bends by itself.
+
     Args:
         headings: of one compass, converted as configured.
     """
-    blocks = []
+    by_line = _wander_beside(imu, headings, 1)
+    if by_line is None or (headings[-1].stamp_ns - headings[0].stamp_ns) / NS_PER_S < _BENDS_S:
+        return by_line
+    by_parabola = _wander_beside(imu, headings, 2)
+    return by_line if by_parabola is None or by_parabola > _BENDS * by_line else by_parabola
+
+
+def _wander_beside(imu: ImuSeries, headings: Sequence[CompassHeading], degree: int) -> float | None:
+    """Return the same with a polynomial of a degree taken off each block."""
+    blocks, first = [], degree + 1  # column after the polynomial's
     for _, turned, yaw, at_s in _blocks(imu, _said(headings), _WANDER_BLOCK_S):
         cell = ((at_s - at_s[0]) // _CELL_S).astype(int)
         if cell[-1] * _CELL_S < _LONG_BLOCK_S:
             continue
         there, count = np.unique(cell, return_counts=True)
         apart = np.unwrap(yaw - turned)
-        columns = [np.ones(len(yaw)), at_s - at_s.mean(), turned, np.gradient(turned, at_s), apart]
+        middle = (at_s - at_s.mean()) / _WANDER_BLOCK_S
+        columns = [*(middle**k for k in range(first)), turned, np.gradient(turned, at_s), apart]
         # The heading by the gyroscope, its bias taken off: by the compass itself, its error would explain itself.
-        along = turned + np.polyval(np.polyfit(at_s - at_s.mean(), apart, 1), at_s - at_s.mean())
+        along = turned + np.polyval(np.polyfit(middle, apart, degree), middle)
         columns += [f(k * along) for k in (1.0, 2.0) for f in (np.sin, np.cos)]
         means = [np.bincount(cell, column)[there] / count for column in columns]
         blocks.append((there, np.column_stack(means)))
     if not blocks:
         return None
     parts = [len(cells) for cells, _ in blocks]
-    common = np.vstack([columns[:, [2, 3, 5, 6, 7, 8]] for _, columns in blocks])
-    lines = block_diag(*(columns[:, :2] for _, columns in blocks))
-    apart, design = np.concatenate([columns[:, 4] for _, columns in blocks]), np.hstack([lines, common])
+    common = np.vstack([np.delete(columns[:, first:], 2, axis=1) for _, columns in blocks])
+    bends = block_diag(*(columns[:, :first] for _, columns in blocks))
+    apart, design = np.concatenate([columns[:, first + 2] for _, columns in blocks]), np.hstack([bends, common])
     left = np.split(apart - design @ np.linalg.lstsq(design, apart, rcond=1e-6)[0], np.cumsum(parts)[:-1])
     soon, late = (_squared_steps(blocks, left, round(lag_s / _CELL_S)) for lag_s in _LAGS_S)
     grown = max(late - soon, 0.0)
     wander = float(np.degrees(np.sqrt(0.5 * grown / (_LAGS_S[1] - _LAGS_S[0]) * _MINUTE_S)))
     cells = [own for own, _ in blocks]
     by_steps = grown / _grown_of_unit(cells, _left_of_unit(cells, design))
-    # No wander scatters by less about a line than it should; what swings evenly only looks as if much had been taken off.
-    off_line = apart - lines @ np.linalg.lstsq(lines, apart, rcond=1e-6)[0]
-    left_of_unit = np.concatenate([cov.diagonal() for cov in _left_of_unit(cells, lines)])
-    by_spread = float((off_line**2).mean() / left_of_unit.mean())
+    # No wander scatters by less about that than it should; what swings evenly only looks as if much had been taken off.
+    off_bend = apart - bends @ np.linalg.lstsq(bends, apart, rcond=1e-6)[0]
+    left_of_unit = np.concatenate([cov.diagonal() for cov in _left_of_unit(cells, bends)])
+    by_spread = float((off_bend**2).mean() / left_of_unit.mean())
     return max(wander, float(np.degrees(np.sqrt(min(by_steps, by_spread)))))
 
 

@@ -29,6 +29,7 @@ from graphloc.frontends._compasses import compasses_of
 from graphloc.frontends._contents import Contents, contents_of
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
+from graphloc.frontends._log_sides import with_side
 from graphloc.frontends._receivers import receiver_of, receivers_of, timed_fixes, timed_velocity, with_wander
 from graphloc.frontends._reports import (
     EAST_AXES,
@@ -109,6 +110,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     taken, imus = imus, [turned_as_its_heading(imu, compasses) for imu in imus]
     if imus and imus[0] is not taken[0]:
         best = _best_imu(bag, imus, evidence)
+    velocities = [(s, with_side(report, s, best.felt if best else None)) for s, report in velocities]
     late = {motion.source: motion_time_offset(best.felt, motion) for motion in motions} if best else {}
     timed = [timed_fixes(report, late, motions, velocities, bag.streams) for report in gnss]
     together = {receiver_of(report.topic): report.late_s for report in timed if report.late_s}

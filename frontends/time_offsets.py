@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 
 from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion
-from graphloc.frontends._clock import MOST_LATE_S, MOST_ON_ITS_WAY_S
+from graphloc.frontends._clock import FARTHEST_LATE_S, MOST_LATE_S, MOST_ON_ITS_WAY_S
 from graphloc.frontends._mount_yaw import FEWEST, MOVES_M, STEP_S, Felt, bent, unbroken, windows_of
 from graphloc.frontends._turns import without_line
 from graphloc.frontends.turning import Turning
@@ -116,10 +116,11 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
     if motion.way_m is None:
         return None
     t, at = felt.t_s, felt.times_of(motion)
-    lags = np.arange(-MOST_LATE_S, MOST_LATE_S + 0.5 * _APART_S, _APART_S)
+    # Where the right offset is farther than is looked, a lesser peak of the same motion takes its place, clearly.
+    lags = np.arange(-FARTHEST_LATE_S, FARTHEST_LATE_S + 0.5 * _APART_S, _APART_S)
     found: list[tuple[float, float, float]] = []
     for half_s in windows_of(motion):
-        margin = half_s + MOST_LATE_S
+        margin = half_s + FARTHEST_LATE_S
         middle = np.arange(max(t[0], at[0]) + margin, min(t[-1], at[-1]) - margin, STEP_S)
         moved, chord = bent(at, motion.way_m, middle, half_s)
         good = (np.abs(chord) > MOVES_M) & unbroken(at, middle, half_s)

@@ -63,10 +63,13 @@ def test_slow_fixes_tell_a_delay_as_fast_ones_do(late_s: float) -> None:
     assert offset.value_s == pytest.approx(-late_s, abs=0.015)
 
 
-@pytest.mark.parametrize("late_s", [0.0, 0.5])
+@pytest.mark.parametrize("late_s", [0.0, 2.2])
 @pytest.mark.parametrize("seed", range(2))
 def test_a_velocity_that_fails_in_a_tunnel_tells_no_delay_of_it(late_s: float, seed: int) -> None:
-    """A car of 12 m/s that turns at the begin of tunnels and speeds up in them: the straight line across fitted an offset, clearly."""
+    """A car of 12 m/s that turns at the begin of tunnels and speeds up in them: the straight line across fitted an offset, clearly.
+
+    An offset of 2.2 s was farther than was looked for.
+    """
     rng, t = np.random.default_rng(seed), np.arange(0.0, 400.0, 1.0 / RATE_HZ)
     knots = np.arange(0.0, 401.0, 8.0)
     speed = gaussian_filter1d(np.interp(t, knots, rng.uniform(6.0, 15.0, len(knots))), RATE_HZ)

@@ -76,6 +76,26 @@ def test_a_frozen_receiver_stays_frozen_while_the_velocity_becomes_uncertain() -
     assert 19.0 < detector.stands_s < 20.5
 
 
+@pytest.mark.parametrize("sigma_m", [0.15, 1.2])
+def test_one_that_goes_on_slower_is_not_frozen_whatever_it_claims(sigma_m: float) -> None:
+    """Multipath had drawn the estimate on and turned: fixes 0.15 m noisy went on at 0.9 m/s, that claimed 1.2 m and so seemed to stand."""
+    ahead = 0.9 * AHEAD
+    assert frozen_at(lambda t, n: 0.15 * n - 1.3 * AHEAD * max(t - 20.0, 0.0), ahead + 1.3 * AHEAD, hz=2.0, sigma_m=sigma_m, until_s=30.0) == []  # fmt: skip
+
+
+@pytest.mark.parametrize("hz", [1.0, 2.0])
+def test_one_that_goes_on_is_believed_again(hz: float) -> None:
+    """A boat at 0.9 m/s whose multipath went astern as fast for 5 s; without fixes the estimate goes astray: the fixes' error grows on."""
+    rng, detector, when = np.random.default_rng(1), FrozenReceiverDetector(), []
+    for t in np.arange(0.0, 60.0, 1.0 / hz).tolist():
+        estimated_m = 0.9 * AHEAD * t + np.array([0.0, 0.5]) * max(t - 25.0, 0.0)
+        told_m = 0.9 * AHEAD * (min(t, 20.0) + max(t - 25.0, 0.0)) + 0.1 * rng.standard_normal(2)
+        detector.note(t, told_m, estimated_m, 0.2, 0.9 * AHEAD, 0.05)
+        when += [t] if detector.frozen else []
+    assert 20.0 < when[0] < 26.0
+    assert when[-1] <= 28.0
+
+
 def test_one_that_moves_otherwise_may_be_right() -> None:
     """The estimate went astray: it stands while the receiver goes on, or goes much faster."""
     assert frozen_at(lambda t, n: 0.2 * n + V * max(t - 20.0, 0.0), 0.0 * V) == []

@@ -175,12 +175,15 @@ def test_headings_of_one_stamp_are_one_heading(run: SimulatedRun) -> None:
 
 
 def test_what_is_no_wander_is_not_taken_for_it(run: SimulatedRun) -> None:
-    """Noise, the gyro's bias and scale, iron that turns with the vessel, late stamps."""
+    """Noise, the gyro's bias and scale, iron that turns with the vessel, late stamps, a gyro that warms up by 0.5 deg/s."""
     imu, headings = of(run)
+    t = (imu.stamps_ns - imu.stamps_ns[0]) / S
+    warms = np.radians(0.5) * np.outer(np.exp(-t / 250.0), [0.0, 0.0, 1.0])
+    warming = replace(imu, gyro_radps=imu.gyro_radps + warms)
     late = [replace(m, stamp_ns=m.stamp_ns + S // 2) for m in headings]
     scaled = replace(imu, gyro_radps=1.02 * imu.gyro_radps)
     iron = changed(headings, lambda yaw: yaw + np.radians(3.0) * np.sin(yaw))
-    for samples, said in ((imu, headings), (scaled, headings), (imu, late), (imu, iron)):
+    for samples, said in ((imu, headings), (scaled, headings), (warming, headings), (imu, late), (imu, iron)):
         found = wander_deg(samples, said)
         assert found is not None
         assert found < 0.6

@@ -18,6 +18,7 @@ WINDOW_S, _FEWEST = 4.0, 4  # seconds and fixes that a decision is made from
 _LEAST_MPS = 0.7  # no multipath drifts so fast
 _SHARE = 0.5  # of the vessel's speed: with late stamps the error also grows in a turn, but by less
 _SIGMAS = 4.0  # of its own noise: so far a receiver that stands may seem to move, and an error to grow; a choice
+_FREEDOM = 4  # degrees of it, at least, that a scatter is told by: four fixes
 # Measured by the receiver: if it moves in another way, it may be right and the estimate wrong.
 _STANDS_MPS, _STANDS_M = 0.3, 0.5
 _LONGEST_S = 15.0  # for which its disagreement does not count against the estimate
@@ -37,6 +38,10 @@ class FrozenReceiverDetector:
         self.frozen = False
         self.stands_s = -np.inf
         self._stands_m: Array | None = None
+        self._place_m, self._still_m = (
+            np.zeros(2),
+            np.inf,
+        )  # where it stood when it was found to be frozen, and how far that is noise
         self._seen: deque[tuple[float, Array, Array]] = deque()
         self._frozen_s = 0.0
         self._along_s: float | None = None  # since when it has moved along
@@ -67,10 +72,12 @@ class FrozenReceiverDetector:
         late = t > t[-1] - (0.5 if self.frozen else 1.0) * WINDOW_S  # shorter when frozen, so that motion is seen soon
         moves, noise = _slope(t[late], told[late])
         moves_mps, of_vessel_mps = float(np.linalg.norm(moves)), _SHARE * float(np.linalg.norm(v_mps))
-        stands = moves_mps < _STANDS_MPS + _SIGMAS * sigma_m * noise
+        # Many claim far more than they scatter by: by that any boat would seem to stand.
+        scatter_m = _scatter(t[late], told[late], moves)
+        stands = moves_mps < _STANDS_MPS + _SIGMAS * min(sigma_m, scatter_m) * noise
         least = max(_LEAST_MPS, of_vessel_mps)
         if self.frozen:  # the growing uncertainty of the velocity without it is no evidence that it moves
-            self.frozen = stands and speed > 0.5 * least
+            self.frozen = stands and speed > 0.5 * least and not self._has_left(told[late])
             return
         least = max(least, _SIGMAS * float(np.hypot(max(sigma_m, rms) * steady, sigma_mps)))
         if self._along_s is None and speed < 0.5 * least:
@@ -81,7 +88,16 @@ class FrozenReceiverDetector:
         self.frozen = along and stands and speed > least and rms < _LINE * speed * float(t[-1] - t[0])
         if self.frozen:  # without its fixes the estimate changes
             self._frozen_s = at_s
+            self._place_m = told[t > t[-1] - 0.5 * WINDOW_S].mean(axis=0)
+            self._still_m = max(_STANDS_M, _SIGMAS * min(sigma_m, scatter_m))
             self._seen.clear()
+
+    def _has_left(self, told: Array) -> bool:
+        """Whether the newest of its fixes (N, 2) are no repetitions of the position that it stood at.
+
+        Two or three of them do not tell how much they scatter, nor then whether they move.
+        """
+        return float(np.linalg.norm(told.mean(axis=0) - self._place_m)) > self._still_m
 
     def _take(self, at_s: float, told_m: Array, estimated_m: Array, sigma_m: float) -> None:
         """Take in a fix and its error (arguments as of `note`), and forget those before the window."""
@@ -91,6 +107,13 @@ class FrozenReceiverDetector:
         self._seen.append((at_s, np.array(told_m), np.array(told_m - estimated_m)))
         while at_s - self._seen[0][0] > 1.25 * WINDOW_S:
             self._seen.popleft()
+
+
+def _scatter(t: Array, places_m: Array, v_mps: Array) -> float:
+    """Noise of places (N, 2), m, at times (N,), s, about a line of velocity (2,), m/s, 1 sigma of an axis; inf where too few tell it."""
+    left = places_m - places_m.mean(axis=0) - np.outer(t - t.mean(), v_mps)
+    freedom = 2 * len(t) - 4
+    return float(np.sqrt((left**2).sum() / freedom)) if freedom >= _FREEDOM else np.inf
 
 
 def _slope(t: Array, places_m: Array) -> tuple[Array, float]:
