@@ -182,7 +182,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
             *bag.warnings,
             *(said for report in gnss for said in (report.stored, report.frozen, report.in_radians) if said),
             *(apart_warning(report) for report in gnss[:1] if report.differs),
-            *unused_topics(list(bag.streams.values()), used),
+            *unused_topics(list(bag.streams.values()), used, sum(t.messages for t in bag.topics.values())),
             *_lacking(bag, imus, gnss, reports),
             *([] if bag.lidars else unread_lidars(bag.topics.values())),
             *([] if bag.cameras else unread_tags(bag.topics.values())),

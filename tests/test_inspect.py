@@ -1084,6 +1084,7 @@ def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
     assert config.sensors == {}
     assert "nothing in this bag" in text
     assert any("no message of a known type" in w for w in inspect_bag(tmp_path / "b" / "run").warnings)
+    assert "the bag holds no message at all" in inspect_bag(hold_bag(tmp_path / "none", make, [])).warnings
 
 
 @pytest.mark.skipif(not HUSKY.exists(), reason="the Husky recording is not here")
