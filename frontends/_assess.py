@@ -313,6 +313,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         extent_m=(float(np.ptp(p[:, 0])), float(np.ptp(p[:, 1]))),
         travelled_m=float(np.hypot(chords[:, 0], chords[:, 1]).sum()),
         first=vec(rows[0, :3]),
+        without_place=int((fixes.rows[sane(fixes), 3] >= 0).sum()) - len(every),
         without_height=int(np.isnan(fixes.rows[every[np.isin(fixes.stamps_ns[every], stamps)], 2]).sum()),
         white_m=scatter_m(stamps[~bad], own[:, :2]),
         uneven=uneven(stamps[~bad], own),

@@ -212,13 +212,13 @@ def _mount_yaw(levelled: _Samples, motions: Sequence[MeasuredMotion]) -> tuple[f
     stays = found.hints and abs(found.yaw_deg) < _AHEAD_DEG
     if not found.clear and (found.likely or stays):
         yaw = float(np.degrees(wrap_angle(np.radians(quarter)))) + 0.0 if found.likely else 0.0
-        said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg, but not clearly (coherence {found.coherence:.2f})"
+        said = f"yaw by the motion of {found.source}: {found.yaw_deg:z.0f} deg, but not clearly (coherence {found.coherence:.2f})"
         return yaw, None, f"{said}: taken as {yaw:.0f}"
     if not found.clear:
         return None, None, f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
     askew = abs(found.yaw_deg - quarter) > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
     yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter)))) + 0.0
-    said = f"yaw by the motion of {found.source}: {found.yaw_deg:.0f} deg (coherence {found.coherence:.2f})"
+    said = f"yaw by the motion of {found.source}: {found.yaw_deg:z.0f} deg (coherence {found.coherence:.2f})"
     off_deg = abs(found.yaw_deg - quarter)
     if not askew and off_deg > max(_SLIGHTLY_DEG, 4.0 * found.sigma_deg):
         said += (
@@ -380,6 +380,7 @@ def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
         reported_gyro_mdps=reported(11, mdps),
         mount=_mount_guess(samples, evidence),
         missing=missing,
+        unfinite=int((~finite).sum()),
     )
     return _righted(report, imu, samples, evidence)
 

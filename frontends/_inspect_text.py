@@ -18,6 +18,7 @@ from graphloc.frontends._reports import (
     TopicReport,
     of_nmea,
 )
+from graphloc.frontends.decode import UNSTAMPED
 from graphloc.plain import aligned
 from graphloc.time import utc_text
 
@@ -94,7 +95,8 @@ def _fate(item: OdometryReport) -> str:
 def _topic_table(topics: Sequence[TopicReport]) -> list[str]:
     rows = [("topic", "type", "count", "Hz", "span s", "gaps", "longest s", "repeated", "backward", "latency s")]
     for t in topics:
-        latency = "-" if t.latency_s is None else f"{t.latency_s[1]:.3f} ({t.latency_s[0]:.3f}..{t.latency_s[2]:.3f})"
+        told = None if t.recorded or t.msgtype in UNSTAMPED else t.latency_s  # no stamps: how late is not known
+        latency = "-" if told is None else f"{told[1]:.3f} ({told[0]:.3f}..{told[2]:.3f})"
         rows.append(
             (
                 t.topic,
@@ -144,6 +146,8 @@ def _imu_lines(imu: ImuReport) -> list[str]:
         *(f"  {why}" for why in imu.why),
         f"  mount: rpy {', '.join(f'{a:.1f}' for a in imu.mount.rpy_deg)} deg; {imu.mount.evidence}",
     ]
+    if imu.unfinite:
+        lines.append(f"  {imu.unfinite} messages hold an acceleration or a rate that is NaN, and are not used")
     if imu.gyro_bias_radps is None:
         lines.append("  no standstill found, so the gyro bias was not measured")
     else:
@@ -163,6 +167,8 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         f"  track {gnss.travelled_m:.0f} m in a box of {east_m:.0f} x {north_m:.0f} m"
         + ("" if flat else f", height {gnss.height_range_m:.1f} m"),
     ]
+    if gnss.without_place:
+        lines.append(f"  {gnss.without_place} fixes lie at 0, 0, are NaN or beyond 90 and 180 deg, and are not used")
     if gnss.without_height:
         lines.append(f"  {gnss.without_height} messages have no height (NaN) and are used as horizontal fixes")
     if gnss.reported_sigma_m is not None:

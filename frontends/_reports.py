@@ -126,6 +126,7 @@ class ImuReport:
         accel_noise_ug, gyro_noise_mdps: noise densities, of the worst axis, at rest or in motion.
         reported_accel_ug, reported_gyro_mdps: densities that the messages' covariances amount to.
         missing: 'rates' or 'accelerations' where all of these are 0: half an IMU, as some drivers publish it; else ''.
+        unfinite: samples that hold NaN.
     """
 
     topic: str
@@ -143,6 +144,7 @@ class ImuReport:
     reported_gyro_mdps: float | None
     mount: MountGuess
     missing: str = ""
+    unfinite: int = 0
 
 
 class Change(NamedTuple):
@@ -185,6 +187,7 @@ class GnssReport:
         apart_m: by how much it and `apart_from`, the receiver it agrees with best, wander against each other, 1 sigma of an axis.
         keeps_m: how far its antenna and that of another receiver are apart at least; 0 where nothing tells.
         by_turns: the fixes of RTK, by their status and what they state, and the others, where both come.
+        without_place: fixes that state none: NaN, 0, 0, or beyond 90 and 180 deg.
         without_height: fixes without one. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
     """
 
@@ -208,6 +211,7 @@ class GnssReport:
     in_radians: str = ""
     wander: tuple[Change, ...] = ()
     wander_by: str = ""
+    without_place: int = 0
     without_height: int = 0
     spans_s: float = 0.0
     late_s: tuple[float, float] | None = None

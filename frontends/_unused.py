@@ -64,12 +64,18 @@ def _of_other_types(bag: Contents) -> list[str]:
     return [f"of no type that is read here: {', '.join(others[:_MOST_NAMED])}{more}"] if others else []
 
 
-def unused_topics(streams: Sequence[TopicData], used: Container[str]) -> list[str]:
-    """Return a line for each IMU and GNSS topic that is not used, with the reason: otherwise they would seem to be missing."""
+def unused_topics(streams: Sequence[TopicData], used: Container[str], messages: int) -> list[str]:
+    """Return a line for each IMU and GNSS topic that is not used, with the reason: otherwise they would seem to be missing.
+
+    Args:
+        messages: how many the bag holds, of any type.
+    """
     lines = (
         []
         if any(len(s) or s.undecodable or s.no_stamp for s in streams)
         else ["the bag holds no message of a known type, or no sentence of NMEA that is read"]
+        if messages
+        else ["the bag holds no message at all"]
     )
     for stream in streams:
         if stream.topic in used or stream.msgtype not in (IMU, *FIX_TYPES):

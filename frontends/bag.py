@@ -366,7 +366,7 @@ def _mount_warnings(
         return []
     wanted = float(np.degrees(wrap_angle(rpy_from_rotation(R)[2] + np.radians(found.yaw_deg))))
     key = f"mount of {mount.tf_frame} in /tf_static" if mount.tf_frame else f"mount.rpy_deg of sensors.{imu.sensor}"
-    said = f"{imu.sensor}: {found.said}: by that the yaw in {key} would be {wanted:.0f}"
+    said = f"{imu.sensor}: {found.said}: by that the yaw in {key} would be {wanted:z.0f}"
     return [f"{said} deg; it is right as it is only of a craft that goes astern or sideways"]
 
 

@@ -303,7 +303,7 @@ def _warnings(
     if gnss and gnss[0].differs:
         yield apart_warning(gnss[0])
     used = {g.topic for g in gnss} | {i.topic for i in imus} | usable
-    yield from unused_topics(list(bag.streams.values()), used)
+    yield from unused_topics(list(bag.streams.values()), used, sum(t.messages for t in topics))
     yield from lacking(bag, imus, gnss, odometry)
     if not bag.lidars:
         yield from unread_lidars(topics)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from graphloc.app import Run, Scans, configured, load, online_smoother, smooth_recording, write
     from graphloc.config import VesselConfig
-    from graphloc.errors import ConfigError, GraphlocError, InputError, SolveError
+    from graphloc.errors import ConfigError, GraphlocError, InputError, OutputError, SolveError
     from graphloc.estimate import Estimate
     from graphloc.frames import Datum, Geodetic
     from graphloc.measurements import (
@@ -32,7 +32,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "app": ("Run", "Scans", "configured", "load", "online_smoother", "smooth_recording", "write"),
     "config": ("VesselConfig",),
-    "errors": ("ConfigError", "GraphlocError", "InputError", "SolveError"),
+    "errors": ("ConfigError", "GraphlocError", "InputError", "OutputError", "SolveError"),
     "estimate": ("Estimate",),
     "frames": ("Datum", "Geodetic"),
     "measurements": (
@@ -57,6 +57,7 @@ __all__ = [
     "ImuSample",
     "InputError",
     "OnlineSmoother",
+    "OutputError",
     "PoseFix",
     "Recording",
     "Run",

@@ -23,6 +23,7 @@ from graphloc.solution import Solution
 
 log = logging.getLogger(__name__)
 _OPEN = "the remaining sensors do not determine position, height and heading over the whole run"
+_ONLY = "no other sensor tells the position"
 _VOTED = 3  # suspects that are set against each other, two by two
 
 
@@ -110,6 +111,9 @@ def _smoothed(job: _Job) -> Solution | str:
         return app.solve(job.recording, config, job.datum)
     except Exception as error:  # noqa: BLE001 - what is left may be anything; the other runs go on
         log.info("without %s: %s", ", ".join(job.without), in_one_line(error))
+        left = (row.of(s) for row in SENSORS for s in config.of_kind(row.kind).values())
+        if not any(row.absolute for row in left):
+            return _ONLY
         if isinstance(error, GraphlocError) and error.__cause__ is None:
             return str(error)  # in the user's words; what wraps another's error has the solver's
         return _OPEN

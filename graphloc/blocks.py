@@ -78,8 +78,11 @@ class MountConfig(Block):
 
 def nearest(key: str, known: list[str]) -> str:
     """Return the known key that is meant by a wrong one, as the end of a message; and all of them, if they are few."""
-    close = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
-    near = f"; did you mean '{close[0]}'?" if close else ""
+    close = difflib.get_close_matches(key, known, n=len(known) or 1, cutoff=0.4)
+    best = max(
+        close, key=lambda name: (difflib.SequenceMatcher(None, name, key).ratio(), name[:1] == key[:1]), default=""
+    )
+    near = f"; did you mean '{best}'?" if best else ""
     return near + (f"; known here: {', '.join(sorted(known))}" if not close or len(known) <= 10 else "")
 
 

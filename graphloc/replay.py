@@ -171,7 +171,7 @@ def replay(
         scans: scans to match for the aerial sensors; None: use the matches in the recording.
         speed: times real time; None: as fast as possible. datum: origin of world; None: as `OnlineSmoother` finds it.
         smoother: to use instead of a new one, for tests. late_ns: as for `arrivals`.
-        stoppable: Ctrl-C ends the replay early, and the result up to then is returned.
+        stoppable: Ctrl-C ends the replay early, and the result up to then is returned, if it had started.
 
     Raises:
         SolveError: it never started. InputError: a map or LiDAR that cannot be used.
@@ -204,6 +204,8 @@ def replay(
     waiting = smoother.waiting_for
     session.finish()
     if not session.estimates:
+        if interrupted:
+            raise KeyboardInterrupt
         lost = recording.lost(config.of_kind("imu"))
         raise SolveError(f"{recording.source}: never started: still waiting for {waiting or 'IMU data'}{lost}")
     recording = with_busy_warning(gathering.recording(), config)

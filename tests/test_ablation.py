@@ -125,7 +125,7 @@ def test_held_out_fixes_stand_in_for_truth_and_what_starts_all_cannot_go(tmp_pat
     assert found.basis == "held"
     gnss = of(found, "gnss")
     assert gnss.rmse_m is None
-    assert gnss.why_not
+    assert gnss.why_not == "no other sensor tells the position"
     page.write(found, tmp_path, "ablate")
     assert "gnss cannot be left out" in (tmp_path / "ablation.html").read_text()
     told = json.loads((tmp_path / "ablation.json").read_text())

@@ -89,6 +89,7 @@ def test_a_draft_from_inspect_gives_a_track(
     [
         ("kind: gnss", "knid: gnss", "did you mean 'kind'"),
         ("kind: gnss", "kind: gnsss", "did you mean 'gnss'"),
+        ("kind: gnss", "kind: gps", "did you mean 'gnss'"),  # as near as 'pose', which begins otherwise
         ("sensors:", "sensros:", "did you mean 'sensors'"),
         ("sensors:", "sensors:\n  b: {kind: gnss, topic: /gnss/fix}", "both read /gnss/fix, which would count twice"),
         (

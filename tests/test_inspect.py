@@ -385,6 +385,23 @@ def test_stamps_gaps_and_latency(tmp_path: Path) -> None:
     assert (camera.count, camera.rate_hz) == (1, None)
 
 
+def test_what_is_nan_is_counted_and_what_has_no_stamp_is_not_late(tmp_path: Path) -> None:
+    make = Messages(2)
+    items = drive(make)
+    nan, still = float("nan"), (0.0, 0.0, G)
+    for k in range(3):
+        items.append(("/fix", START_NS + (11 + k) * S + 1, make.fix(START_NS + (11 + k) * S + 1, nan, nan, nan)))
+    items.append(("/imu", START_NS + 12 * S + 1, make.imu(START_NS + 12 * S + 1, (nan, 0.0, G), still)))
+    items += [("/heading", START_NS + k * S // 10, make.t["std_msgs/msg/Float64"](data=0.1)) for k in range(100)]
+    found, _, _ = look(tmp_path, items, make)
+    assert (found.imus[0].unfinite, found.gnss[0].without_place) == (1, 3)
+    text = render(found)
+    assert "1 messages hold an acceleration or a rate that is NaN" in text
+    assert "3 fixes lie at 0, 0, are NaN" in text
+    (line,) = [line for line in text.splitlines() if line.startswith("/heading  ")]
+    assert line.split()[-1] == "-"
+
+
 def test_an_imu_whose_samples_come_out_of_order_is_assessed_in_order(tmp_path: Path) -> None:
     """It had a fifth of its rate, gaps, and half as much noise again: what came late was left out, as if smooth did so."""
     make, rng = Messages(2), np.random.default_rng(2)
@@ -1069,6 +1086,7 @@ def test_truth_poses_and_empty_bags(tmp_path: Path) -> None:
     assert config.sensors == {}
     assert "nothing in this bag" in text
     assert any("no message of a known type" in w for w in inspect_bag(tmp_path / "b" / "run").warnings)
+    assert "the bag holds no message at all" in inspect_bag(hold_bag(tmp_path / "none", make, [])).warnings
 
 
 @pytest.mark.skipif(not HUSKY.exists(), reason="the Husky recording is not here")

@@ -71,7 +71,12 @@ def test_without_truth_there_is_nothing_to_hold_bounds_against(data: ReportData)
     recording = replace(data.recording, truth=None)
     assert plots.consistency(recording, data.solution, ()) is None
     assert plots.coverage(recording, data.solution, ()) is None
-    assert set(figures(replace(data, recording=recording))) == {"map", "errors", "residuals", "slow"}
+    made = figures(replace(data, recording=recording))
+    assert set(made) == {"map", "errors", "residuals", "slow"}
+    assert [panel.title for panel in made["errors"].panels] == [
+        "position, 95 % bound",
+        "heading, 95 % bound",
+    ]  # no error is drawn
 
 
 def test_an_outage_and_bad_health_are_shaded_by_both(data: ReportData) -> None:

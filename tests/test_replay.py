@@ -137,6 +137,14 @@ def test_ctrl_c_keeps_what_there_is(run: SimulatedRun) -> None:
     assert sorted(row.seq for row in found.solution.ledger if row.seq >= 0) == every
 
 
+def test_ctrl_c_before_the_start_is_said_to_be_that(run: SimulatedRun) -> None:
+    def status(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):  # not that it never started
+        replay(run.recording, run.config, stoppable=True, status=status)
+
+
 def test_compare_has_it_beside_the_filters(run: SimulatedRun) -> None:
     compared = app.simulated(run, compare=True)
     names = [f.name for f in compared.filters]

@@ -195,6 +195,8 @@ def test_held_out_fixes_without_rtk_measure_nothing() -> None:
     assert {m.sensor for m in found.held} == {"gnss"}
     assert len(found.held) == held.count("gnss")
     assert f"Another {held.count('gnss_other')} without RTK were kept out" in app.report_data(found).truth_statement
+    alone = replace(found, solution=replace(found.solution, slow={}))  # as where no other sensor tells the drift
+    assert ["a drift that they share" in app.truth_statement(made) for made in (found, alone)] == [False, True]
     row = replace(found.recording.rows[-1], sensor="velocity", outcome=Outcome.HELD_OUT)  # of a gap
     beside = replace(
         found,

@@ -197,6 +197,7 @@ def test_without_truth_online_is_held_against_offline(data: ReportData, share: f
         replace(data, recording=replace(data.recording, truth=None), online=online, tables=(held_table(),))
     ).tracks[1]
     assert said.trust is expected
+    assert said.accuracy == "Horizontal RMSE 0.20 m at held-out fixes."
     (text,) = (r.text for r in said.reasons if "from the offline track" in r.text)
     assert float(text.split()[2]) == pytest.approx(3.0 * np.sqrt(share), rel=0.1)  # RMS of 3 m over that share
     assert "3.00 m at most" in text

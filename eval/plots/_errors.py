@@ -76,7 +76,7 @@ def error_over_time(
         else:
             continue
         largest_m[who] = float(size.max())
-    title, limit = _zoomed(largest_m)
+    title, limit = _zoomed(largest_m) if largest_m else ("position, 95 % bound", None)
     panels = (
         Panel(title=title, y="m", marks=tuple(position), from_zero=True, range_y=limit),
         Panel(title="heading error" if recording.truth else "heading, 95 % bound", y="deg", marks=tuple(heading), from_zero=True),

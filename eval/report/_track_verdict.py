@@ -408,7 +408,8 @@ def _accuracy(data: ReportData, name: str) -> str:
     if mine is None:
         return "Its accuracy was not measured."
     most = values[name].get(key.replace("rmse", "max"))
-    said = f"Horizontal RMSE {mine:.2f} m" + ("" if most is None else f", worst {most:.2f} m")
+    at = " at held-out fixes" if key == "horizontal_rmse_m" else ""
+    said = f"Horizontal RMSE {mine:.2f} m{at}" + ("" if most is None else f", worst {most:.2f} m")
     others = {n: v for n, row in values.items() if n != name and (v := row[key]) is not None}
     if name != data.solution.name:  # the offline track is no rival: it knows what came later
         others.pop(data.solution.name, None)

@@ -73,9 +73,13 @@ def truth_statement(run: Run) -> str:
         )
         if velocities:
             beside += f" The {velocities} GNSS velocities in the gaps were kept out, too, as in an outage."
+        shared = not {fix.sensor for fix in run.held} <= set(run.solution.slow)
+        drift = (
+            ", a drift that they share with the fixes around them is not: no other sensor tells it" if shared else ""
+        )
         return (
             f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; their own noise is part "
-            f"of the error.{beside} The track in this folder lacks them: for the best track run again without --hold-out."
+            f"of the error{drift}.{beside} The track in this folder lacks them: for the best track run again without --hold-out."
         )
     said = "No truth and no held-out fixes: nothing here measures accuracy"
     by = suggested(run.recording.of(GnssPosition))
