@@ -147,6 +147,7 @@ class Solution:
         offsets: what the run says of levers, mounts and stamps; None where it was not asked.
         time_offsets_s: by sensor, what is to be added to its stamps beyond the configured offset, s, where the run estimates it.
         antennas_off_m: by receiver, how far its antenna is from where it is taken to sit (3,), body axes, where the run estimates it.
+        doubts: why no pose is called good.
     """
 
     datum: Datum
@@ -166,6 +167,7 @@ class Solution:
     offsets: Offsets | None = None
     time_offsets_s: Mapping[str, float] = field(default_factory=dict)
     antennas_off_m: Mapping[str, Array] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -178,6 +180,7 @@ class Solution:
         doubt = HealthReason(why, Cause.CONTRADICTION)
         return replace(
             self,
+            doubts=(*self.doubts, why),
             health=tuple(Health.DEGRADED if g else health for g, health in zip(good, self.health, strict=True)),
             health_reason=tuple(doubt if g else reason for g, reason in zip(good, self.health_reason, strict=True)),
         )

@@ -148,6 +148,14 @@ def test_a_camera_or_lidar_that_was_left_at_the_guess_is_said(
     assert not any("cameras" in r.text or "lidars" in r.text for r in track.reasons)  # nothing of it is used
 
 
+def test_what_makes_all_poses_doubtful_is_said_first(data: ReportData) -> None:
+    """Of an IMU turned by 90 deg, and of a receiver alone, the verdict was the same."""
+    doubted = data.solution.doubted("the vessel is tilted by 179 deg for most of the run")
+    (offline, _) = verdict(replace(data, solution=doubted)).tracks
+    assert offline.reasons[0].text == "No bound includes this: the vessel is tilted by 179 deg for most of the run."
+    assert offline.reasons[0].trust is Trust.WITH_CARE
+
+
 def test_a_table_without_any_value_is_no_main_table(data: ReportData) -> None:
     """The report could not be written."""
     empty = Table("Against held-out fixes", ("horizontal_rmse_m",), (("graphloc", (None,)), ("BL EKF", (None,))))

@@ -91,11 +91,17 @@ def track_verdict(data: ReportData, solution: Solution) -> TrackVerdict:
         solution: one of `data.solutions`.
     """
     reasons = (
-        *_bounds(solution), *_coverage(data, solution), *_heading_coverage(data, solution),
+        *_doubted(solution), *_bounds(solution), *_coverage(data, solution), *_heading_coverage(data, solution),
         *_far_from_fixes(data, solution), *_late(data, solution), *_levers(data, solution), *_origins(data, solution),
         *_beside(data, solution), *_from_offline(data, solution), *_compared(data, solution), *_solved(data, solution),
     )  # fmt: skip
     return TrackVerdict(name=solution.name, accuracy=_accuracy(data, solution.name), reasons=reasons)
+
+
+def _doubted(solution: Solution) -> Iterator[Reason]:
+    """Yield what is wrong with the configuration or the recording: in a run whose health is poor anyway, nothing else up here says so."""
+    for why in solution.doubts:
+        yield Reason(trust=Trust.WITH_CARE, text=f"No bound includes this: {why.rstrip('.')}.")
 
 
 def _bounds(solution: Solution) -> Iterator[Reason]:
