@@ -6,7 +6,6 @@ from collections import Counter
 from pathlib import Path
 
 from graphloc import Scans, load, smooth_recording
-from graphloc.frames import heading_deg_from_yaw
 from graphloc.time import utc_text
 from graphloc.trajectory import bounds_95
 
@@ -18,7 +17,7 @@ solution = run.solution  # graphloc.write(run, folder) makes the run folder with
 track = solution.trajectory  # body in world (east, north, up), about ten poses a second
 places = solution.datum.geodetic_from_enu(track.p_world_m)
 bounds = bounds_95(track.cov)
-headings = heading_deg_from_yaw(track.yaw_rad)
+headings = solution.datum.true_heading_deg(track.yaw_rad, track.p_world_m)
 for k in range(0, len(track), 50):
     lat, lon, _ = places[k]
     print(f"{utc_text(int(track.stamps_ns[k]))}  {lat:.7f}  {lon:.7f}  {headings[k]:.1f} deg  +- {bounds[k, 0]:.2f} m")

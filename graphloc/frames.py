@@ -89,7 +89,7 @@ class Datum:
         return np.column_stack([lat, lon, h])
 
     def convergence_rad(self, p_world_m: Array) -> Array:
-        """Return by how much true north at places (..., 3) in world lies counter-clockwise of north at the origin: 0.2 deg at 10 km east in latitude 60."""
+        """Return by how much true north at places (..., 3) in world lies counter-clockwise of north at the origin: 0.16 deg at 10 km east in latitude 60."""
         p = np.asarray(p_world_m, dtype=float)
         latitude_rad = np.radians(self.origin.latitude_deg) + p[..., 1] / EARTH_M
         return np.asarray(p[..., 0] * np.tan(latitude_rad) / EARTH_M)

@@ -124,7 +124,7 @@ def start_of(measured: list[MountedMeasurement], recording: Recording, datum: Da
     psi = 0.0
     if heading is not None:
         assert isinstance(heading.m, CompassHeading)
-        psi = heading.m.yaw_rad - heading.mount_yaw
+        psi = heading.m.yaw_rad - heading.mount_yaw + float(datum.convergence_rad(p))
     else:
         far = np.flatnonzero(np.hypot(*(track - track[0]).T) > 5.0)
         if len(far):

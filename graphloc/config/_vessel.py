@@ -48,7 +48,7 @@ class StartConfig(Block):
     window_s: Positive = 20.0
     """Longest span of data for the start alignment, s."""
     heading_deg: Finite | None = None
-    """Heading at the start (from true north, clockwise) if no sensor measures it, deg."""
+    """Heading at the start (from true north at the datum, clockwise) if no sensor measures it, deg."""
     heading_sigma_deg: Positive = 10.0
     """Its 1 sigma, deg."""
 

@@ -81,9 +81,10 @@ class BiasWalk:
         """Lower a raised walk to what the biases have gone at most, and return a line on that; or empty."""
         for k in np.flatnonzero(self.times > 1.0).tolist():
             share = walks_less(self._known, lag.problem.links, k)
-            if share is None:
+            less = 1.0 if share is None else max(share, 1.0 / self.times[k])
+            if less > _LEAST_LESS:
                 continue
-            self.times[k] = max(self.times[k] * share, 1.0)
+            self.times[k] = max(self.times[k] * less, 1.0)
             name = samples().sensor
             imu = lag.problem.config.sensors[name]
             return f"{name}: its biases change less than before: {KEYS[k]} is {getattr(imu, KEYS[k]):.3g}, {getattr(self.of(imu), KEYS[k]):.3g} is taken"
@@ -103,8 +104,7 @@ def walks_less(known: Sequence[KnownBias], links: InertialLink, k: int) -> float
     if not (likely < _TOO_LITTLE).any():
         return None
     n = int(np.argmin(likely))
-    share = float(np.sqrt(squares[n] / chdtri(freedom[n], _AT_MOST)))
-    return share if share < _LEAST_LESS else None
+    return float(np.sqrt(squares[n] / chdtri(freedom[n], _AT_MOST)))
 
 
 def _steps(known: Sequence[KnownBias], links: InertialLink, axis: int) -> Iterator[tuple[int, float]]:

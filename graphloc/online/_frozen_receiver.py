@@ -38,10 +38,8 @@ class FrozenReceiverDetector:
         self.frozen = False
         self.stands_s = -np.inf
         self._stands_m: Array | None = None
-        self._place_m, self._still_m = (
-            np.zeros(2),
-            np.inf,
-        )  # where it stood when it was found to be frozen, and how far that is noise
+        # Where it stood when it was found to be frozen, and how far that is noise.
+        self._place_m, self._still_m = np.zeros(2), np.inf
         self._seen: deque[tuple[float, Array, Array]] = deque()
         self._frozen_s = 0.0
         self._along_s: float | None = None  # since when it has moved along

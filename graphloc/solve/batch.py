@@ -231,7 +231,7 @@ class _Underway:
         del self.solved  # and its graph, before the next one is made
         try:
             self._solve_first(other)
-            if np.isinf(lowest) or self._cost(other) < lowest:
+            if lowest == np.inf or self._cost(other) < lowest:
                 return True
         except SolveError:
             pass  # it cannot be solved so
