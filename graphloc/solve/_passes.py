@@ -15,6 +15,8 @@ from graphloc.solve.decide import Stage, Verdicts, decisions, log_evidence, met,
 from graphloc.solve.stretch import moved, unwound
 
 SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1
+# Of the cost, by which a step changes it: half a sigma of what it moves. A heading that nothing tells turns by degrees at each.
+_SETTLED_NATS = 0.1
 # Of the thinned run: the passes over the whole one begin there and go on to `SETTLED_M`; a choice.
 _ROUGHLY_SETTLED_M = 0.5
 _UPHILL = 1.1  # times the cost before: above it a single step has failed
@@ -23,7 +25,7 @@ _OUTLIER = 0.1  # weight under its own kernel below which a measurement is an ou
 
 @dataclass(frozen=True, slots=True)
 class Optimised:
-    """One optimisation of the whole run: values, the graph they come from, and how far any pose moved.
+    """One optimisation of the whole run: values, the graph they come from, how far any pose moved, and by how much the cost changed (nats).
 
     `made`: where the factors of each measurement stand in the graph.
     """
@@ -33,6 +35,11 @@ class Optimised:
     made: Made
     iterations: int
     moved_m: float
+    changed_nats: float
+
+    def settled(self) -> bool:
+        """Return whether it moved the track by little, or by little of what is known of it."""
+        return self.moved_m < SETTLED_M or self.changed_nats < _SETTLED_NATS
 
 
 def optimise_run(
@@ -42,7 +49,14 @@ def optimise_run(
     last, made = len(problem.timeline) - 1, Made()
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps, made=made)
     solved = optimize(graph, guess, 12, 1e-3)
-    return Optimised(solved.values, graph, made, solved.iterations, moved(guess, solved.values))
+    return _optimised(graph, made, guess, solved.values, solved.iterations)
+
+
+def _optimised(
+    graph: gtsam.NonlinearFactorGraph, made: Made, guess: gtsam.Values, values: gtsam.Values, iterations: int
+) -> Optimised:
+    changed_nats = abs(float(graph.error(values)) - float(graph.error(guess)))
+    return Optimised(values, graph, made, iterations, moved(guess, values), changed_nats)
 
 
 def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Optimised:
@@ -53,7 +67,7 @@ def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, pri
     before = float(graph.error(guess))
     if not float(graph.error(values)) < _UPHILL * before + 1.0:
         values, iterations, _ = optimize(graph, guess, 12, 1e-3)
-    return Optimised(values, graph, made, iterations, moved(guess, values))
+    return _optimised(graph, made, guess, values, iterations)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +102,7 @@ def settle(
         used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage=Stage.FINAL)
         _date(verdicts, used, n + 1)
         progress("final passes", n + 1, most)
-        if estimate is done.values and n > 0 and done.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
+        if estimate is done.values and n > 0 and done.settled() and changed(used, verdicts) < SETTLED_WEIGHT:
             break
     assert done is not None
     return Settled(
@@ -98,7 +112,7 @@ def settle(
         verdicts=verdicts,
         passes=n + 1,
         iterations=iterations,
-        converged=done.moved_m < 3 * SETTLED_M,
+        converged=done.moved_m < 3 * SETTLED_M or done.settled(),
     )
 
 
