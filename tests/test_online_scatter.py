@@ -9,7 +9,7 @@ import pytest
 from graphloc.eval.simulate import bl_scenario, simulate
 from graphloc.frames import wrap_angle
 from graphloc.measurements import CompassHeading
-from graphloc.online._scatter import Scatter
+from graphloc.online._scatter import Scatter, _Median
 from graphloc.replay import replay
 from tests.slowly import with_few_states
 
@@ -30,6 +30,14 @@ def test_it_is_how_many_times_wider_than_configured_they_are(k: int, rate_hz: fl
     white = np.random.default_rng(2).standard_normal((600, k))
     assert scatter_of(4.0 * white, rate_hz) == pytest.approx(4.0, rel=0.15)
     assert scatter_of(0.5 * white, rate_hz) == 1.0
+
+
+def test_the_median_of_the_last_residuals() -> None:
+    rng, median = np.random.default_rng(3), _Median()
+    values = np.round(rng.normal(size=1000), 1).tolist()  # many are equal
+    for k, value in enumerate(values):
+        median.append(value)
+        assert median.value() == pytest.approx(np.median(values[max(k - 299, 0) : k + 1]))
 
 
 def test_what_they_have_in_common_does_not_make_them_wide() -> None:

@@ -68,27 +68,26 @@ class FrozenReceiverDetector:
         left = off - off.mean(axis=0) - np.outer(t - t.mean(), growth)
         rms, speed = float(np.sqrt((left**2).sum(axis=1).mean())), float(np.linalg.norm(growth))
         late = t > t[-1] - (0.5 if self.frozen else 1.0) * WINDOW_S  # shorter when frozen, so that motion is seen soon
-        moves, noise = _slope(t[late], told[late])
-        moves_mps, of_vessel_mps = float(np.linalg.norm(moves)), _SHARE * float(np.linalg.norm(v_mps))
-        # Many claim far more than they scatter by: by that any boat would seem to stand.
-        scatter_m = _scatter(t[late], told[late], moves)
-        stands = moves_mps < _STANDS_MPS + _SIGMAS * min(sigma_m, scatter_m) * noise
+        of_vessel_mps = _SHARE * float(np.linalg.norm(v_mps))
         least = max(_LEAST_MPS, of_vessel_mps)
         if self.frozen:  # the growing uncertainty of the velocity without it is no evidence that it moves
+            moves_mps, noise_m, noise_mps = _motion(t[late], told[late], sigma_m)
+            stands = moves_mps < _STANDS_MPS + _SIGMAS * noise_mps
             self.frozen = stands and speed > 0.5 * least and not self._has_left(told[late])
             return
         least = max(least, _SIGMAS * float(np.hypot(max(sigma_m, rms) * steady, sigma_mps)))
         if self._along_s is None and speed < 0.5 * least:
             self._along_s = at_s
         along = self._along_s is not None and at_s - self._along_s > _ALONG_S
+        if not (along and speed > least and rms < _LINE * speed * float(t[-1] - t[0])):
+            return
+        moves_mps, noise_m, noise_mps = _motion(t[late], told[late], sigma_m)
         # Few or noisy fixes do not show whether it stands: it may as well move as the vessel does.
-        stands &= moves_mps < max(_STANDS_MPS, of_vessel_mps)
-        self.frozen = along and stands and speed > least and rms < _LINE * speed * float(t[-1] - t[0])
-        if self.frozen:  # without its fixes the estimate changes
-            self._frozen_s = at_s
+        if moves_mps < min(_STANDS_MPS + _SIGMAS * noise_mps, max(_STANDS_MPS, of_vessel_mps)):
+            self.frozen, self._frozen_s = True, at_s
             self._place_m = told[t > t[-1] - 0.5 * WINDOW_S].mean(axis=0)
-            self._still_m = max(_STANDS_M, _SIGMAS * min(sigma_m, scatter_m))
-            self._seen.clear()
+            self._still_m = max(_STANDS_M, _SIGMAS * noise_m)
+            self._seen.clear()  # without its fixes the estimate changes
 
     def _has_left(self, told: Array) -> bool:
         """Whether the newest of its fixes (N, 2) are no repetitions of the position that it stood at.
@@ -105,6 +104,14 @@ class FrozenReceiverDetector:
         self._seen.append((at_s, np.array(told_m), np.array(told_m - estimated_m)))
         while at_s - self._seen[0][0] > 1.25 * WINDOW_S:
             self._seen.popleft()
+
+
+def _motion(t: Array, places_m: Array, sigma_m: float) -> tuple[float, float, float]:
+    """Speed of places (N, 2), m, at times (N,), s; the noise of a place (m), of which `sigma_m` is claimed; and that of the speed."""
+    v_mps, noise = _slope(t, places_m)
+    # Many claim far more than they scatter by: by that any boat would seem to stand.
+    noise_m = min(sigma_m, _scatter(t, places_m, v_mps))
+    return float(np.linalg.norm(v_mps)), noise_m, noise_m * noise
 
 
 def _scatter(t: Array, places_m: Array, v_mps: Array) -> float:

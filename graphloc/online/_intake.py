@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,8 +24,7 @@ _BEHIND, _LOST = "its stamp does not increase", "held back as it leapt, and then
 _PERIODS = 1000  # newest steps, from which the IMU's period is taken
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Taken:
+class Taken(NamedTuple):
     """What becomes of a sample, and of one that was held back until it came.
 
     Attributes:
@@ -104,7 +103,7 @@ class ImuIntake:
             spiked += wrong
         already, self._spiked = self._spiked, self._spiked or bool(spiked)
         dropped = (*taken.dropped, *((held, _LOST) for held in lost), *((held, SPIKE) for held in spiked))
-        return replace(taken, accepted=tuple(accepted), dropped=dropped, newly_spiked=self._spiked and not already)
+        return taken._replace(accepted=tuple(accepted), dropped=dropped, newly_spiked=self._spiked and not already)
 
     def left(self) -> list[ImuSample]:
         """Return what is still held back at the end."""

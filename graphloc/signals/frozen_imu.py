@@ -101,11 +101,11 @@ class _Stretch:
     def __init__(self, least_s: float, fewest: int) -> None:
         self._least_ns, self._fewest = least_s * NS_PER_S, fewest
         self._first_ns, self._repeats = 0, 0
-        self._row = np.zeros(0)
+        self._row: Array | None = None
 
     def goes_on(self, stamp_ns: int, row: Array) -> bool:
         """Take in a row; return whether it repeats the first of its stretch, and the stretch is long enough."""
-        if stamp_ns < self._first_ns or not np.array_equal(row, self._row):
+        if stamp_ns < self._first_ns or self._row is None or (row != self._row).any():
             self._first_ns, self._row, self._repeats = stamp_ns, row, 0
             return False
         self._repeats += 1
