@@ -208,11 +208,14 @@ def _title(runs: Sequence[FinishedRun]) -> str:
 
 
 def _remarks(runs: Sequence[FinishedRun]) -> list[str]:
-    """Return a line for each run that did not converge, for each warning, and for each run without a reference."""
-    said = [f"- {run.name}: the solver did not converge" for run in runs if not run.converged]
-    said += [f"- {run.name}: warning: {line}" for run in runs for line in run.warnings]
-    said += [f"- {run.name}: nothing to compare it with" for run in runs if not run.tables]
-    return said
+    """Return what there is to say of runs, each line once, with the runs that it is of: most warnings of a vessel come with every run."""
+    of: dict[str, list[str]] = {}
+    for run in runs:
+        unsettled, alone = not run.converged, not run.tables
+        said = ["the solver did not converge"] * unsettled + ["nothing to compare it with"] * alone
+        for line in dict.fromkeys([*said, *(f"warning: {line}" for line in run.warnings)]):
+            of.setdefault(line, []).append(run.name)
+    return [f"- {', '.join(names)}: {line}" for line, names in of.items()]
 
 
 def _page(runs: Sequence[FinishedRun], found: Sequence[MetricTable], folder: Path) -> str:
