@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-from graphloc.config import GnssConfig, SlowErrorConfig
+from graphloc.chi2 import chi2_95
+from graphloc.config import GnssConfig, OutputConfig, SlowErrorConfig
 from graphloc.frontends._assess_wander import slow_error_by
 from graphloc.frontends._draft_lines import FILTERED, antenna_lines, filtered_lines, numbered, topic_lines
 from graphloc.frontends._fixes import NOTHING_M, RTK_SIGMA_M, SCATTERS
@@ -55,14 +57,25 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         lines.append(f"  slow_error: {{{_RTK_SLOW_ERROR}}}  # guess: {why}")
     else:
         # Left to the default, which is on where a second absolute sensor can tell the error from motion.
-        large, said = _slow_error(gnss)
+        slow_m, large, said = _slow_error(gnss)
         vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3)
         more = ", ".join([*([f"vertical_sigma_m: {vertical:.1f}"] if wanders else []), *large])
         fixed = f"; {{{_RTK_SLOW_ERROR}}} where RTK is fixed throughout" if gnss.rtk_sigma_m else ""
         if gnss.reported_sigma_m and max(gnss.reported_sigma_m[:2]) < RTK_SIGMA_M:
             fixed = f"; {{{_RTK_SLOW_ERROR}}} if RTK makes them as good as they claim, which their status does not say"
         lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{said}{fixed}")
+        lines += _never_good(slow_m)
     return lines
+
+
+def _never_good(slow_m: float) -> list[str]:
+    """Say that no pose is called good by this receiver alone, where its slow error is so large (m, 1 sigma of an axis)."""
+    within_m, good_m = math.sqrt(chi2_95(2)) * slow_m, OutputConfig().good_bound_m
+    if within_m <= good_m:
+        return []
+    return [
+        f"  # by that error alone 95 % of all poses are within {within_m:.1f} m, and above output.good_bound_m ({good_m:g} m) they are 'degraded': raise it, or add a sensor of position"
+    ]
 
 
 def _other_block(name: str, gnss: GnssReport, others: PartOfFixes, *, enabled: bool) -> list[str]:
@@ -109,8 +122,8 @@ def _wandering(gnss: GnssReport) -> str:
     return f"  min_vertical_sigma_m: 5.0  # guess: height ranges over {gnss.height_range_m:.0f} m"
 
 
-def _slow_error(gnss: GnssReport) -> tuple[list[str], str]:
-    """Return the keys of a horizontal slow error other than by default, and why: as large and fast as wheels or a velocity show.
+def _slow_error(gnss: GnssReport) -> tuple[float, list[str], str]:
+    """Return the horizontal slow error (m), its keys other than by default, and why: as large and fast as wheels or a velocity show.
 
     Otherwise these contradict the fixes, and what gives way is the heading.
     """
@@ -118,10 +131,10 @@ def _slow_error(gnss: GnssReport) -> tuple[list[str], str]:
     sigma_m, why = _as_large(gnss)
     found = slow_error_by(gnss.wander, sigma_m)
     if found is None:
-        return ([f"horizontal_sigma_m: {sigma_m:.1f}"] if sigma_m > default_m else []), why
+        return sigma_m, ([f"horizontal_sigma_m: {sigma_m:.1f}"] if sigma_m > default_m else []), why
     seen = ", ".join(f"{change.m:.1f} m in {change.span_s:.0f} s" for change in gnss.wander)
     keys = [f"horizontal_sigma_m: {found[0]:.1f}", f"time_constant_s: {found[1]:.0f}"]
-    return keys, f"; by {gnss.wander_by} it changes by {seen}{why}"
+    return found[0], keys, f"; by {gnss.wander_by} it changes by {seen}{why}"
 
 
 def _as_large(gnss: GnssReport) -> tuple[float, str]:

@@ -177,6 +177,7 @@ def test_a_whole_draft(tmp_path: Path) -> None:
     assert gnss.statuses == {"gbas": 300}
     assert config.sensors["gnss"].slow_error.enabled is None
     assert config.sensors["gnss"].slow_error.horizontal_sigma_m == pytest.approx(0.03)
+    assert "good_bound_m" not in text
     assert (compass.usable, compass.convention) == (True, "ned")
     assert config.sensors["compass"].convention == "ned"
     assert config.check_speed_topic == "/wheel/odom"
@@ -314,8 +315,9 @@ def test_without_gravity_the_turns_tell_which_axis_is_up(rpy_deg: tuple[float, f
 
 def test_standard_receiver_gets_a_slow_error(tmp_path: Path) -> None:
     make = Messages(2)
-    found, config, _ = look(tmp_path, drive(make, status=1, sigma_m=1.2), make)
+    found, config, text = look(tmp_path, drive(make, status=1, sigma_m=1.2), make)
     assert config.sensors["gnss"].slow_error.enabled is None  # on where a second absolute sensor is
+    assert "within 4.9 m, and above output.good_bound_m (2.5 m) they are 'degraded'" in text  # 2 m x 2.45
     assert found.gnss[0].reported_sigma_m == pytest.approx((1.2, 1.2, 1.2))
     assert max(found.gnss[0].scatter_m or (1.0,)) < 0.02  # the data are smooth, whatever they claim
 
