@@ -132,6 +132,16 @@ def _short(given: object) -> str:
     return text if len(text) <= _LONG else f"{text[: _LONG - 3]}..."
 
 
+def _trouble(error: Exception) -> str:
+    """Return what is wrong with a file of YAML, in one line: its parser quotes the lines that it means, too."""
+    mark = getattr(error, "problem_mark", None)
+    if mark is None:
+        return " ".join(str(error).split())
+    begun, context = getattr(error, "context_mark", None), getattr(error, "context", None)
+    since = "" if context is None or begun is None else f" ({context} that begins in line {begun.line + 1})"
+    return f"line {mark.line + 1}, column {mark.column + 1}: {getattr(error, 'problem', '')}{since}"
+
+
 def read_mapping(path: Path | Traversable, cure: str = "") -> Mapping[str, Any]:
     """Read a file of YAML 1.2 (no tags) whose top level is a mapping; an empty one gives an empty mapping.
 
@@ -153,7 +163,7 @@ def read_mapping(path: Path | Traversable, cure: str = "") -> Mapping[str, Any]:
     try:
         raw = _loaded(content.decode("utf-8"))
     except Exception as error:  # noqa: BLE001 - besides its own errors ruamel.yaml lets those of int() and such through
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())[:200]}") from None
+        raise ConfigError(f"{path}: not valid YAML: {_trouble(error)[:200]}") from None
     if _values_in(raw, {}) > _MOST_VALUES:
         raise ConfigError(f"{path}: more than {_MOST_VALUES} values, each alias (*) counted as what it stands for")
     if raw is None:

@@ -105,7 +105,7 @@ def test_a_draft_from_inspect_gives_a_track(
         ("topic: /gnss/fix", "topic: /gnss/fxi", "/gnss/fix"),
         ("kind: imu", "kind: imu\n    accel_unit: furlong", "accel_unit"),
         ("kind: imu", "kind: imu\n    accel_noise_ug_per_sqrt_hz: -3", "accel_noise_ug_per_sqrt_hz"),
-        ("sensors:", "sensors: [", "not valid YAML"),
+        ("sensors:", "sensors: [", "that begins in line 2)"),
         ("sensors:", "vessel: !!python/object/apply:os.system ['touch pwned']\nsensors:", "not valid YAML"),
     ],
 )
@@ -149,7 +149,7 @@ def test_bad_arguments_are_one_line(
         ([*good[:5], Path(os.devnull)], "is a file"),
         ([*good[:5], file / "run"], "is a file"),
         (["simulate", "bl1-pink", "-o", tmp_path / "sim"], "bl1-pink"),
-        (["inspect", bag[0], "-o", tmp_path / "nowhere/x.yaml"], "nowhere/x.yaml"),
+        (["inspect", bag[0], "-o", bag[1] / "x.yaml"], "is a file, and a folder is wanted"),
         (["smoth"], "Did you mean 'smooth'"),
         (["smooth"], "see graphloc smooth --help"),
         ([*good, "--foo"], "--foo"),

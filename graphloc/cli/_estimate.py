@@ -32,8 +32,10 @@ def inspect(
 ) -> None:
     """Show what a bag holds and write a first vessel.yaml, with every guess marked."""
     from graphloc.errors import InputError, OutputError
+    from graphloc.folders import check_writable
     from graphloc.frontends import inspect as inspection
 
+    check_writable(config)
     found = inspection.inspect_bag(bag)
     typer.echo(json.dumps(found.as_dict(), indent=2) if as_json else inspection.render(found))
     if not found.usable:
@@ -42,6 +44,7 @@ def inspect(
     if config.exists() and not overwrite:
         raise OutputError(f"{config}: exists already; give another --out, or --overwrite")
     try:
+        config.parent.mkdir(parents=True, exist_ok=True)
         config.write_text(inspection.draft_config(found), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{config}: cannot be written ({error.strerror})") from None
