@@ -15,6 +15,7 @@ from itertools import count
 
 import numpy as np
 
+from graphloc import keys
 from graphloc.config import KernelConfig
 from graphloc.errors import SolveError
 from graphloc.frames import Array
@@ -273,6 +274,8 @@ class Judge:
             held = [e.within for e in own]
             cov = self._states.joint(attached, [modes[0] for modes in found])
             weighed, unplaced = choices(stream, [e.index for e in own], found, cov, held)
+            if unplaced:
+                weighed, unplaced = self._solved_without(stream, own) or (weighed, unplaced)
             best = weighed[0].modes
             now = tuple(h[0] if h is not None and h[1] >= AGREES else None for h in held)
             chosen = frozenset((e.index, mode) for e, mode in zip(own, best, strict=True))
@@ -286,6 +289,29 @@ class Judge:
                 self._others[stream.name] = mean, around
             return tried > 0
         return True
+
+    def _solved_without(self, stream: LiveStream, own: list[Entry]) -> tuple[list[Choice], bool] | None:
+        """Return the choices (see `choices`) from the window solved without these measurements; None where it cannot be.
+
+        They are much more precise than all else together: linear algebra does not tell where that leaves the estimate.
+        """
+        self._window.settle()
+        newest = keys.pose(self._problem.timeline.last)
+        here, back = self._window.values.atPose3(newest).translation(), self._entries.marked(own)
+        try:
+            for entry in own:
+                self._entries.change(entry, replace(entry.verdict, decision=None))
+            self._window.settle(_STEPS)
+            attached, found = self._attach(own)
+            cov = self._states.joint(attached, [modes[0] for modes in found])
+            weighed, unplaced = choices(stream, [e.index for e in own], found, cov, [e.within for e in own])
+            step = np.zeros(len(cov))
+            step[:3] = self._window.values.atPose3(newest).translation() - here
+            return [replace(c, step=c.step + step) for c in weighed], unplaced
+        except (SolveError, RuntimeError, ArithmeticError, ValueError, np.linalg.LinAlgError):
+            return None
+        finally:
+            back()
 
     def _try(self, stream: LiveStream, own: list[Entry], others: list[Verdict]) -> None:
         """Apply other verdicts and iterate; restore the window where that is less probable, or the solver diverges.
