@@ -242,6 +242,14 @@ def inertial_of(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> Ine
     return Inertial(Felt.of(*_in_body(series, report, evidence), gravity_mps2), series)
 
 
+def feels_motion(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> bool:
+    """Return whether an IMU whose mount is known or guessed clearly feels how the craft moves, whichever way its mount is turned."""
+    if not evidence.motions:
+        return False
+    found = yaw_in_craft(*_in_body(_series_of(imu, report), report, evidence), evidence.motions)
+    return found is not None and found.clear
+
+
 def _turning_of(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> Turning:
     """Return the integrated rate of an IMU whose mount is known or guessed, with its gyro bias removed if known."""
     stamps, _, gyro = _in_body(_series_of(imu, report), report, evidence)

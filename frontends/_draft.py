@@ -147,7 +147,7 @@ def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
         why = (
             reason
             if imu.missing
-            else "one IMU is used: a whole one, with gravity in it, and with least gyro noise, of about equal ones that whose mount tf or the motion tells"
+            else "one IMU is used: a whole one, with gravity in it, that feels how the vessel moves, and with least gyro noise, of about equal ones that whose mount tf or the motion tells"
         )
         lines.append(f"  enabled: false  # guess: {why}")
     if imu.accel_unit != "m/s^2":

@@ -21,7 +21,14 @@ from graphloc.frontends._assess import (
     track,
     vec,
 )
-from graphloc.frontends._assess_imu import ImuEvidence, Inertial, imu_report, inertial_of, turned_as_its_heading
+from graphloc.frontends._assess_imu import (
+    ImuEvidence,
+    Inertial,
+    feels_motion,
+    imu_report,
+    inertial_of,
+    turned_as_its_heading,
+)
 from graphloc.frontends._assess_receivers import apart_warning
 from graphloc.frontends._assess_velocity import motion_of_poses, motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of
@@ -213,11 +220,15 @@ def _motions(
 
 
 def _imu_reports(bag: Contents, evidence: ImuEvidence) -> list[ImuReport]:
-    """Report the IMUs: whole ones with gravity in them first, the least noisy ones first; of those about as noisy, one whose mount tf or the motion tells."""
-    imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, evidence))]
+    """Report the IMUs: whole ones with gravity in them first, of these any that feel how the craft moves, the least noisy ones first; of those about as noisy, one whose mount tf or the motion tells.
 
-    def kind(imu: ImuReport) -> tuple[bool, bool]:
-        return bool(imu.missing), imu.gravity == "removed"
+    One that feels nothing of what another one feels turns on its own: that of a stabilised camera.
+    """
+    imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, evidence))]
+    moved = {imu.topic for imu in imus if len(imus) > 1 and feels_motion(bag.aligned[imu.topic], imu, evidence)}
+
+    def kind(imu: ImuReport) -> tuple[bool, bool, bool]:
+        return bool(imu.missing), imu.gravity == "removed", imu.topic not in moved
 
     def key(imu: ImuReport) -> tuple[object, ...]:
         least = min(other.gyro_noise_mdps for other in imus if kind(other) == kind(imu))

@@ -488,6 +488,34 @@ def drift(t: Array, _yaw: Array) -> Array:
     return np.asarray(error / error.std(axis=0) * [4.0, 4.0, 8.0])
 
 
+def test_the_fix_of_a_base_ashore_is_not_the_vessels(tmp_path: Path) -> None:
+    """Of a centimetre, and that of the vessel of 0.3 m: it was taken for the receiver, its antenna for 55 m off the mount, and the vessel stood still."""
+    make = Messages(2)
+    items = drive(make, status=0, sigma_m=0.5, seconds=60, noise_m=0.3)
+    for k in range(60):
+        at = START_NS + k * S
+        items.append(
+            ("/base/fix", at, make.fix(at, 58.001, 11.002, 44.0 + 1e-4 * (k % 7), 2, 1e-4 * np.eye(3).ravel()))
+        )
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == ["/fix"]
+    assert {s.mount_sigma_m for s in config.of_kind("gnss").values()} == {1.0}
+    assert "a base station ashore" in text
+
+
+def test_the_imu_of_a_stabilised_camera_is_not_the_vessels(tmp_path: Path) -> None:
+    """It is less noisy, pans by itself, and feels nothing of the way of the craft: it was taken for the IMU, and the compass for one that wanders by 130 deg."""
+    make, rng = Messages(2), np.random.default_rng(5)
+    items = drive(make, seconds=60)
+    for k in range(60 * 50):
+        at, (up, noise) = START_NS + k * S // 50, 1e-4 * rng.normal(size=(2, 3))
+        up[2] += G
+        noise[2] += 0.5 * np.sin(0.02 * k)  # it pans
+        items.append(("/camera/imu", at, make.imu(at, up.tolist(), noise.tolist(), frame="camera")))
+    _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert config.sensors["imu"].topic == "/imu"
+
+
 def test_of_two_receivers_the_one_whose_height_drifts_is_not_used(tmp_path: Path) -> None:
     """It claimed half of what the other did, was used, and its drift of 4 m went into the track without a word."""
     make = Messages(2)
