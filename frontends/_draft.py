@@ -31,6 +31,10 @@ _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
 _WANDER_DEG, _LARGER = 0.7, 1.4
 _TURNED_DEG = 10.0  # off the course, from which a compass is taken for turned in the craft
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
+_DRIFTS = (
+    10.0,
+    600.0,
+)  # wander, deg, and its time, s, of a yaw without a north: cheap ones drift by a degree in half a minute; a choice
 _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 
@@ -222,7 +226,13 @@ def _error_lines(compass: CompassReport) -> list[str]:
         why = "passing errors near iron; 0.2 for a GNSS compass"
     if wander > max(_WANDER_DEG, _LARGER * usual):
         usual, why = wander, "as it wanders beside the gyro; iron near it, or its own filter"
-    return [*lines, f"  wander_sigma_deg: {usual:.1f}  # guess: {why}"]
+    if compass.drifts:
+        usual, why = (
+            max(_DRIFTS[0], usual),
+            "its north is its own, as without a magnetometer: it drifts; 0.5 if it is magnetic",
+        )
+    lines.append(f"  wander_sigma_deg: {usual:.1f}  # guess: {why}")
+    return [*lines, f"  wander_time_constant_s: {_DRIFTS[1]:.0f}  # guess: likewise"] if compass.drifts else lines
 
 
 def _mount_lines(compass: CompassReport) -> list[str]:

@@ -256,6 +256,7 @@ class CompassReport:
         two_antennas: whether a GNSS receiver says it, by its sentence, its topic, or as an Imu with an orientation alone.
         late_s: what should be added to its stamps by the gyroscope, s, and 1 sigma; None where that does not tell. What is said above is
             of corrected stamps. late_with_fixes: not the gyroscope tells it, but the fixes of the same messages.
+        drifts: whether its north is its own, so that it drifts as a gyroscope does.
     """
 
     topic: str
@@ -273,6 +274,7 @@ class CompassReport:
     two_antennas: bool = False
     late_s: tuple[float, float] | None = None
     late_with_fixes: bool = False
+    drifts: bool = False
 
     @property
     def ahead(self) -> bool:

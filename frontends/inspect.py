@@ -32,7 +32,7 @@ from graphloc.frontends._assess_imu import (
 from graphloc.frontends._assess_receivers import apart_warning
 from graphloc.frontends._assess_velocity import motion_of_poses, motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of
-from graphloc.frontends._compasses import compasses_of
+from graphloc.frontends._compasses import compasses_of, with_own_north
 from graphloc.frontends._contents import Contents, contents_of
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
@@ -129,7 +129,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
         topics=_topic_reports(bag),
         imus=tuple(imus),
         gnss=_with_wander(bag, timed, odometry, velocities, motions),
-        compasses=compasses,
+        compasses=tuple(with_own_north(compass, imus) for compass in compasses),
         odometry=tuple(reports),
         velocities=tuple(timed_velocity(report, late.get(report.topic), together) for _, report in velocities),
         lidars=lidars_of(bag),

@@ -516,6 +516,45 @@ def test_the_imu_of_a_stabilised_camera_is_not_the_vessels(tmp_path: Path) -> No
     assert config.sensors["imu"].topic == "/imu"
 
 
+def test_a_course_over_ground_is_no_heading(tmp_path: Path) -> None:
+    """Of a vessel that is set about by a current: drafted as a compass that wanders by 43 deg, it drew the heading 34 deg off, online, out of its bounds."""
+    make = Messages(2)
+    items = drive(make, status=0, sigma_m=0.5, seconds=150, noise_m=0.1)
+    fixes = [(at, m) for topic, at, m in items if topic == "/fix"]
+    t = np.array([(at - START_NS) / S for at, _ in fixes])
+    set_m = 15.0 * np.column_stack([np.sin(t / 8.0), np.cos(t / 11.0), 0.0 * t])
+    p = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for _, m in fixes]).T) + set_m
+    items = [item for item in items if item[0] not in ("/fix", "/compass", "/wheel/odom")]
+    step = np.gradient(p, axis=0)
+    for (at, m), (lat, lon, up), (east, north, _) in zip(fixes, DATUM.geodetic_from_enu(p), step, strict=True):
+        half = np.arctan2(north, east) / 2.0
+        items.append(("/fix", at, make.fix(at, lat, lon, up, 0, m.position_covariance)))
+        items.append(("/gps/heading", at, make.compass(at, (0.0, 0.0, np.sin(half), np.cos(half)))))
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert not config.of_kind("compass")
+    assert "as a course over ground does" in text
+
+
+@pytest.mark.parametrize(("zero_deg", "drifts"), [(124.0, True), (90.0, False), (12.0, False)])
+def test_the_yaw_of_an_imu_without_a_north_drifts(zero_deg: float, *, drifts: bool, tmp_path: Path) -> None:
+    """It counts from where it was switched on: taken for a compass, its drift of 8 deg in 200 s left a third of the headings outside their bounds."""
+    make = Messages(2)
+    items = drive(make, status=0, sigma_m=0.5, seconds=60)
+    yaws = [(at, 2.0 * np.arctan2(m.quaternion.z, m.quaternion.w)) for topic, at, m in items if topic == "/compass"]
+    at_ns, yaw = np.array([at for at, _ in yaws]), np.unwrap([y for _, y in yaws])
+    for topic, at, m in items:
+        if topic == "/imu":
+            half = (np.pi / 2.0 - np.interp(at, at_ns, yaw) - np.radians(zero_deg)) / 2.0
+            m.orientation, m.orientation_covariance = (
+                make.quat((0.0, 0.0, np.sin(half), np.cos(half))),
+                np.eye(3).ravel(),
+            )
+    _, config, _ = look(tmp_path, [item for item in items if item[0] != "/compass"], make)
+    compass = config.sensors["compass"]
+    assert isinstance(compass, CompassConfig)
+    assert (compass.wander_sigma_deg >= 5.0) == drifts
+
+
 def test_of_two_receivers_the_one_whose_height_drifts_is_not_used(tmp_path: Path) -> None:
     """It claimed half of what the other did, was used, and its drift of 4 m went into the track without a word."""
     make = Messages(2)
