@@ -243,9 +243,9 @@ def inertial_of(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> Ine
 
 
 def feels_motion(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> bool:
-    """Return whether an IMU whose mount is known or guessed clearly feels how the craft moves, whichever way its mount is turned."""
-    if not evidence.motions:
-        return False
+    """Return whether an IMU whose mount is known or guessed clearly feels how the craft moves, whichever way its mount is turned, or turns as it does."""
+    if _against_courses(imu, report, evidence) > 0:
+        return True
     found = yaw_in_craft(*_in_body(_series_of(imu, report), report, evidence), evidence.motions)
     return found is not None and found.clear
 

@@ -189,7 +189,7 @@ class GnssReport:
         by_turns: the fixes of RTK, by their status and what they state, and the others, where both come.
         without_place: fixes that state none: NaN, 0, 0, or beyond 90 and 180 deg.
         without_height: fixes without one. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
-        roams_m: diagonal of the box, 10 % to 90 %, of the places. ashore: why it is not of this craft, beside another one; '' where it may be.
+        roams_m: diagonal of the box, 10 % to 90 %, of the places. elsewhere: why it is not of this craft, beside another one; '' where it may be.
     """
 
     topic: str
@@ -224,7 +224,7 @@ class GnssReport:
     keeps_m: float = 0.0
     by_turns: tuple[PartOfFixes, PartOfFixes] | None = None
     roams_m: float = 0.0
-    ashore: str = ""
+    elsewhere: str = ""
 
     @property
     def rtk_sigma_m(self) -> tuple[float, float] | None:

@@ -29,7 +29,7 @@ from graphloc.frontends._assess_imu import (
     inertial_of,
     turned_as_its_heading,
 )
-from graphloc.frontends._assess_receivers import apart_warning
+from graphloc.frontends._assess_receivers import TWO_CRAFT_M, apart_warning
 from graphloc.frontends._assess_velocity import motion_of_poses, motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of
 from graphloc.frontends._compasses import compasses_of, with_own_north
@@ -89,6 +89,7 @@ _AS_NOISY = 1.5  # gyro noise, times that of the least noisy IMU, up to which on
 _DOWN = np.diag([1.0, -1.0, -1.0])  # to axes ahead, to port, up from such ahead, to starboard, down
 _BELOW_M, _ALIKE = 0.05, 0.9  # antennas in tf, from which its z points down; cosine between axes taken for the same
 _FEWEST = 20  # places of a track
+_STAYS = 0.05  # as a share of the way of a receiver, within which another one stays where it is
 
 
 def inspect_bag(bags: Bags | Bag) -> Inspection:
@@ -105,6 +106,8 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     """
     bag = contents_of(bags)
     gnss = receivers_of(bag)
+    if elsewhere := _elsewhere(bag, gnss):
+        gnss = receivers_of(bag, elsewhere)
     reference = _best_track(bag, gnss)
     odometry = _odometry_reports(bag, gnss, reference)
     velocities = _velocity_reports(bag, reference)
@@ -139,6 +142,37 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
         in_body=in_body,
         warnings=(*bag.warnings, *_warnings(bag, gnss, imus, compasses, reports)),
     )
+
+
+def _elsewhere(bag: Contents, gnss: Sequence[GnssReport]) -> dict[str, str]:
+    """Return why receivers are not of this craft, by topic: the best IMU feels nothing of how they move, but of how another one does, far from them."""
+    farthest_m = max((report.roams_m for report in gnss), default=0.0)
+
+    def stays(report: GnssReport) -> bool:
+        return report.roams_m < _STAYS * farthest_m and farthest_m >= TWO_CRAFT_M
+
+    if not gnss or not (gnss[0].apart_m >= TWO_CRAFT_M or stays(gnss[0])):
+        return {}
+    motions = motions_of((), (), bag.of_type(*FIX_TYPES))
+    imus = _imu_reports(bag, ImuEvidence(motions, None, bag.tree))
+
+    def felt(report: GnssReport) -> bool:
+        reference = _best_track(bag, [report])
+        own = [motion for motion in motions if motion.source == report.topic]
+        evidence = ImuEvidence(own, courses_of(reference) if len(reference.stamps_ns) else None, bag.tree)
+        return bool(imus) and feels_motion(bag.aligned[imus[0].topic], imus[0], evidence)
+
+    unfelt = {report.topic for report in gnss if not felt(report)}
+    aboard = next((report for report in gnss if report.topic not in unfelt), None)
+    if aboard is None or aboard is gnss[0]:
+        return {}
+    why = f"{imus[0].topic} feels how {aboard.topic} moves, and nothing of how this one does: of another craft"
+    base = f"while {aboard.topic} goes {aboard.roams_m:.0f} m, as {imus[0].topic} feels: a base station ashore, or a receiver that hangs"
+    return {
+        report.topic: f"it stays within {report.roams_m:.2f} m {base}" if stays(report) else why
+        for report in gnss
+        if report.topic in unfelt and (report.apart_m >= TWO_CRAFT_M or stays(report))
+    }
 
 
 def _topic_reports(bag: Contents) -> tuple[TopicReport, ...]:
@@ -311,7 +345,7 @@ def _warnings(
     usable = {c.topic for c in compasses if c.usable}
     for report in gnss:
         yield from filter(None, (report.stored, report.frozen, report.in_radians))
-    if gnss and gnss[0].differs:
+    if gnss and (gnss[0].differs or gnss[0].apart_m >= TWO_CRAFT_M):
         yield apart_warning(gnss[0])
     used = {g.topic for g in gnss} | {i.topic for i in imus} | usable
     yield from unused_topics(list(bag.streams.values()), used, sum(t.messages for t in topics))

@@ -503,6 +503,28 @@ def test_the_fix_of_a_base_ashore_is_not_the_vessels(tmp_path: Path) -> None:
     assert "a base station ashore" in text
 
 
+@pytest.mark.parametrize("moored", [False, True])
+def test_the_receiver_of_another_craft_is_not_the_vessels(moored: bool, tmp_path: Path) -> None:
+    """A target's RTK, better than the own receiver, was taken for it. Where the IMU feels neither, as of a vessel that lies moored, a line says so."""
+    make = Messages(2)
+    items = drive(make, status=0, sigma_m=0.5, seconds=60, noise_m=0.3)
+    for k in range(300):
+        at, a = START_NS + k * S // 5, 0.03 * k
+        lat, lon, up = DATUM.geodetic_from_enu(np.array([[300.0 * np.sin(a), 300.0 * np.cos(0.7 * a), 0.0]]))[0]
+        items.append(("/target/fix", at, make.fix(at, lat, lon, up, 2, 1e-4 * np.eye(3).ravel())))
+    if moored:
+        place = next(m for topic, _, m in items if topic == "/fix")
+        for topic, at, m in items:
+            if topic == "/fix":
+                m.latitude, m.longitude = place.latitude + 1e-6 * (at // S % 7), place.longitude
+            elif topic == "/imu":
+                m.linear_acceleration.x = m.linear_acceleration.y = m.angular_velocity.z = 1e-3 * (at // 10**7 % 5)
+    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert any("two craft" in line for line in found.warnings) == moored
+    assert ("of another craft" in text) == (not moored)
+    assert moored or [s.topic for s in config.of_kind("gnss").values() if s.enabled] == ["/fix"]
+
+
 def test_the_imu_of_a_stabilised_camera_is_not_the_vessels(tmp_path: Path) -> None:
     """It is less noisy, pans by itself, and feels nothing of the way of the craft: it was taken for the IMU, and the compass for one that wanders by 130 deg."""
     make, rng = Messages(2), np.random.default_rng(5)
