@@ -58,6 +58,7 @@ from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import Pose
 from graphloc.frontends._unused import (
     lacking,
+    shared_topics,
     unread_lidars,
     unread_tags,
     unused_magnetometers,
@@ -348,6 +349,7 @@ def _warnings(
     if gnss and (gnss[0].differs or gnss[0].apart_m >= TWO_CRAFT_M):
         yield apart_warning(gnss[0])
     used = {g.topic for g in gnss} | {i.topic for i in imus} | usable
+    yield from shared_topics(list(bag.streams.values()))
     yield from unused_topics(list(bag.streams.values()), used, sum(t.messages for t in topics))
     yield from lacking(bag, imus, gnss, odometry)
     if not bag.lidars:
