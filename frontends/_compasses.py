@@ -7,8 +7,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 from graphloc.frames import wrap_angle
-from graphloc.frontends._assess import Courses
+from graphloc.frontends._assess import Courses, MeasuredMotion
 from graphloc.frontends._assess_compass import compass_report, headings, in_enu, says_the_same
 from graphloc.frontends._assess_imu import Inertial
 from graphloc.frontends._contents import Contents
@@ -23,6 +26,7 @@ from graphloc.measurements import CompassHeading
 from graphloc.time import NS_PER_S
 
 _NONE: Late = {}
+_FEWEST = 20  # places
 _NO_HEADING_DEG = 20.0  # of wander within a minute, from which the motion tells the heading better; a choice
 _OWN_NORTH_DEG = 20.0  # off a quarter turn: more than declination and leeway are in most places
 
@@ -108,7 +112,7 @@ def _beside_gyro(heading: _Heading, best: Inertial) -> CompassReport:
     bad, wander = scattered(best.series, measured), wander_deg(best.series, measured)
     report = replace(report, wander_deg=wander)
     most = [m for m, off in zip(measured, bad, strict=True) if not off]
-    steady_deg = (wander_deg(best.series, most) if bad.any() else wander) or 0.0
+    steady_deg = min(wander or 0.0, wander_deg(best.series, most) or 0.0)
     if steady_deg > _NO_HEADING_DEG and against_turning(best.felt.turning, stamps, angle):
         why = f"it wanders by {steady_deg:.0f} deg (1 sigma) beside the integrated gyro, as a course over ground does, which is no heading"
         return replace(report, usable=False, why=why)
@@ -127,3 +131,21 @@ def with_own_north(compass: CompassReport, imus: Sequence[ImuReport]) -> Compass
     x_deg = own.mount.rpy_deg[2] if own.mount.yaw_told else 0.0
     off_deg = compass.offset_deg - x_deg
     return replace(compass, drifts=abs(off_deg - 90.0 * round(off_deg / 90.0)) > _OWN_NORTH_DEG)
+
+
+def headed(motion: MeasuredMotion, compass: CompassReport, stream: TopicData) -> MeasuredMotion | None:
+    """Return a motion with where the craft heads, by a compass as it is drafted, while that tells; None of a few places.
+
+    Courses tell it only of a craft that goes ahead, not of a ferry with two bows.
+    """
+    late_ns = round(compass.late_s[0] * NS_PER_S) if compass.late_s else 0
+    stamps, angle = headings(stream)
+    yaw = in_enu(angle, compass.convention) - np.radians(compass.turned_deg)
+    t_s = (stamps + late_ns - motion.origin_ns) / NS_PER_S
+    inside = (motion.t_s >= t_s[0]) & (motion.t_s <= t_s[-1])
+    if motion.way_m is None or inside.sum() < _FEWEST:
+        return None
+    at_s = motion.t_s[inside]
+    attitude = Rotation.from_euler("z", np.interp(at_s, t_s, yaw)[:, None])
+    kept = {"t_s": at_s, "speed_mps": motion.speed_mps[inside], "way_m": motion.way_m[inside]}
+    return replace(motion, source=f"{motion.source} beside the heading of {compass.topic}", attitude=attitude, **kept)

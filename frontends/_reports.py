@@ -18,6 +18,9 @@ Vec = tuple[float, float, float]
 # HDT and THS of a GNSS receiver; topics of ublox_gps, septentrio_gnss_driver, mavros and their like.
 _TWO_ANTENNAS = re.compile(r"[ +]G[A-Z](HDT|THS)$|gps|gnss|nav_?heading|rel_?pos|dual|moving_?bas", re.IGNORECASE)
 _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
+TURNED_DEG = 10.0
+"""Off the course, from which a compass is taken for turned in the craft."""
+_ASKEW_DEG = 15.0  # off a quarter turn, from which it sits askew
 _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset of its compass as well
 _DIFFERS = 1.5  # times the default of a slow error
 # Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
@@ -280,6 +283,14 @@ class CompassReport:
     def ahead(self) -> bool:
         """Whether it is that of the course, nearly."""
         return self.usable and self.offset_deg is not None and abs(self.offset_deg) < 180.0 - _ASTERN_DEG
+
+    @property
+    def turned_deg(self) -> float:
+        """By how much it is taken to be turned in the craft: by quarters, unless the course says otherwise; 0 where leeway explains that, or nothing tells."""
+        if self.offset_deg is None or abs(self.offset_deg) <= TURNED_DEG:
+            return 0.0
+        quarter = 90.0 * round(self.offset_deg / 90.0)
+        return quarter if abs(self.offset_deg - quarter) < _ASKEW_DEG else float(round(self.offset_deg))
 
     @property
     def backwards(self) -> bool:

@@ -27,12 +27,13 @@ from graphloc.frontends._assess_imu import (
     feels_motion,
     imu_report,
     inertial_of,
+    turned_as_headed,
     turned_as_its_heading,
 )
 from graphloc.frontends._assess_receivers import TWO_CRAFT_M, apart_warning
 from graphloc.frontends._assess_velocity import motion_of_poses, motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of
-from graphloc.frontends._compasses import compasses_of, with_own_north
+from graphloc.frontends._compasses import compasses_of, headed, with_own_north
 from graphloc.frontends._contents import Contents, contents_of
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
@@ -118,7 +119,10 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     imus, in_body = _in_axes_up(bag, gnss, _imu_reports(bag, evidence))
     best = _best_imu(bag, imus, evidence)
     compasses = compasses_of(bag, courses, best)
-    taken, imus = imus, [turned_as_its_heading(imu, compasses) for imu in imus]
+    taken, imus = (
+        imus,
+        [turned_as_its_heading(imu, compasses) for imu in _beside_headings(bag, imus, evidence, compasses)],
+    )
     if imus and imus[0] is not taken[0]:
         best = _best_imu(bag, imus, evidence)
     velocities = [(s, with_side(report, s, best.felt if best else None)) for s, report in velocities]
@@ -276,6 +280,21 @@ def _imu_reports(bag: Contents, evidence: ImuEvidence) -> list[ImuReport]:
 
 def _best_imu(bag: Contents, imus: Sequence[ImuReport], evidence: ImuEvidence) -> Inertial | None:
     return inertial_of(bag.aligned[imus[0].topic], imus[0], evidence) if imus else None
+
+
+def _beside_headings(
+    bag: Contents, imus: Sequence[ImuReport], evidence: ImuEvidence, compasses: Sequence[CompassReport]
+) -> list[ImuReport]:
+    """Return the reports with the yaw of mounts that the first compass tells which is no IMU's own and knows north."""
+    known = (
+        c for c in compasses if c.usable and c.offset_deg is not None and c.topic not in {imu.topic for imu in imus}
+    )
+    compass = next(known, None)
+    if compass is None:
+        return list(imus)
+    moved = (headed(motion, compass, bag.aligned[compass.topic]) for motion in evidence.motions)
+    told = [motion for motion in moved if motion]
+    return [turned_as_headed(bag.aligned[imu.topic], imu, evidence, told) for imu in imus]
 
 
 def _in_axes_up(

@@ -536,6 +536,31 @@ def test_sensors_that_share_a_topic_are_named(shared: bool, tmp_path: Path) -> N
     assert any("/fix: its messages name several frames (bow" in line for line in found.warnings) == shared
 
 
+@pytest.mark.parametrize("turned_deg", [0.0, 90.0, 180.0])
+def test_a_compass_tells_how_the_imu_of_a_ferry_with_two_bows_is_turned(turned_deg: float, tmp_path: Path) -> None:
+    """It goes astern for half of the time, where its course is no heading: the mount was taken as not turned, and the heading 88 deg off."""
+    make, rng = Messages(2), np.random.default_rng(7)
+    t = np.arange(0.0, 90.0, 0.02)
+    speed, rate = 3.0 * np.sin(0.25 * t), 0.06 * np.sin(0.1 * t)
+    yaw = 0.4 + np.cumsum(rate) * 0.02
+    east, north = (np.cumsum(speed * f(yaw)) * 0.02 for f in (np.cos, np.sin))
+    R = Rotation.from_euler("z", turned_deg, degrees=True).as_matrix()
+    accel = np.column_stack([np.gradient(speed, 0.02), speed * rate, np.full(len(t), G)]) + rng.normal(
+        0.0, 0.05, (len(t), 3)
+    )
+    lla = DATUM.geodetic_from_enu(np.column_stack([east, north, 0.0 * t]) + rng.normal(0.0, 0.1, (len(t), 3)))
+    items: list[Item] = []
+    for k, felt in enumerate((accel @ R).tolist()):
+        at = START_NS + k * S // 50
+        items.append(("/imu", at, make.imu(at, felt, (0.0, 0.0, rate[k] + 1e-3 * rng.normal()))))
+        if k % 10 == 0:
+            half = yaw[k] / 2.0
+            items.append(("/fix", at, make.fix(at, lla[k][0], lla[k][1], lla[k][2], 0, 0.25 * np.eye(3).ravel())))
+            items.append(("/compass", at, make.compass(at, (0.0, 0.0, np.sin(half), np.cos(half)))))
+    _, config, _ = look(tmp_path, items, make)
+    assert config.sensors["imu"].mount.rpy_deg == pytest.approx((0.0, 0.0, turned_deg))
+
+
 def test_the_imu_of_a_stabilised_camera_is_not_the_vessels(tmp_path: Path) -> None:
     """It is less noisy, pans by itself, and feels nothing of the way of the craft: it was taken for the IMU, and the compass for one that wanders by 130 deg."""
     make, rng = Messages(2), np.random.default_rng(5)
