@@ -8,9 +8,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from graphloc.frames import wrap_angle
+from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import Courses, MeasuredMotion
 from graphloc.frontends._assess_compass import compass_report, headings, in_enu, says_the_same
 from graphloc.frontends._assess_imu import Inertial
@@ -23,11 +24,13 @@ from graphloc.frontends.decode import IMU, NUMBERS, QUATERNION
 from graphloc.frontends.time_offsets import heading_time_offset
 from graphloc.frontends.turning import Turning, against_turning
 from graphloc.measurements import CompassHeading
+from graphloc.signals.series import runs
 from graphloc.time import NS_PER_S
 
 _NONE: Late = {}
 _FEWEST = 20  # places
 _NO_HEADING_DEG = 20.0  # of wander within a minute, from which the motion tells the heading better; a choice
+_HELD_RAD = np.radians(5.0)  # of a turn, from which no compass says the same
 _OWN_NORTH_DEG = 20.0  # off a quarter turn: more than declination and leeway are in most places
 
 
@@ -99,7 +102,7 @@ def _beside_gyro(heading: _Heading, best: Inertial) -> CompassReport:
     """Return the report with the wander and the number of scattered headings, both relative to the gyroscope of the best IMU.
 
     What wanders too far, though on the whole it turns as the gyroscope does, is no heading: a course over ground follows the vessel where it is
-    set, and looks anywhere while it stands.
+    set, and looks anywhere while it stands. A compass that hangs for a while is one.
     """
     report, stream = heading
     if not report.usable:
@@ -111,12 +114,22 @@ def _beside_gyro(heading: _Heading, best: Inertial) -> CompassReport:
     ]
     bad, wander = scattered(best.series, measured), wander_deg(best.series, measured)
     report = replace(report, wander_deg=wander)
-    most = [m for m, off in zip(measured, bad, strict=True) if not off]
+    left_out = bad | _held(best.felt.turning, stamps, angle)
+    most = [m for m, off in zip(measured, left_out, strict=True) if not off]
     steady_deg = min(wander or 0.0, wander_deg(best.series, most) or 0.0)
     if steady_deg > _NO_HEADING_DEG and against_turning(best.felt.turning, stamps, angle):
         why = f"it wanders by {steady_deg:.0f} deg (1 sigma) beside the integrated gyro, as a course over ground does, which is no heading"
         return replace(report, usable=False, why=why)
     return replace(report, why=f"{report.why}; {bad.sum()} of {len(measured)}: {SCATTERED}") if bad.any() else report
+
+
+def _held(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> NDArray[np.bool_]:
+    """Return (N,) which headings repeat the one before them while the craft turns away from it."""
+    turned = np.interp((stamps_ns - turning.origin_ns) / NS_PER_S, turning.t_s, turning.turned_rad)
+    held = np.append(False, np.diff(angle) == 0.0)
+    for first, after in runs(held):
+        held[first:after] &= np.ptp(turned[first - 1 : after]) > _HELD_RAD
+    return held
 
 
 def with_own_north(compass: CompassReport, imus: Sequence[ImuReport]) -> CompassReport:

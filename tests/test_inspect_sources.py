@@ -593,6 +593,18 @@ def test_a_course_over_ground_is_no_heading(tmp_path: Path) -> None:
     assert "as a course over ground does" in text
 
 
+def test_a_compass_that_hangs_for_a_while_is_one(tmp_path: Path) -> None:
+    """Meanwhile the craft turns away from what it says, as from a course over ground."""
+    make, held = Messages(2), None
+    items = drive(make, status=0, sigma_m=0.5, seconds=120)
+    for topic, at, m in items:
+        if topic == "/compass" and 45.0 < (at - START_NS) / S < 65.0:
+            held = held or m.quaternion
+            m.quaternion = held
+    _, config, _ = look(tmp_path, items, make)
+    assert "compass" in config.sensors
+
+
 @pytest.mark.parametrize(("zero_deg", "drifts"), [(124.0, True), (90.0, False), (12.0, False)])
 def test_the_yaw_of_an_imu_without_a_north_drifts(zero_deg: float, *, drifts: bool, tmp_path: Path) -> None:
     """It counts from where it was switched on: taken for a compass, its drift of 8 deg in 200 s left a third of the headings outside their bounds."""
