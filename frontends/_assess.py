@@ -312,6 +312,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         height_range_m=float(np.subtract(*np.percentile(rows[:, 2], [95, 5]))),
         extent_m=(float(np.ptp(p[:, 0])), float(np.ptp(p[:, 1]))),
         travelled_m=float(np.hypot(chords[:, 0], chords[:, 1]).sum()),
+        roams_m=float(np.hypot(*np.subtract(*np.percentile(p[:, :2], [90, 10], axis=0)))),
         first=vec(rows[0, :3]),
         without_place=int((fixes.rows[sane(fixes), 3] >= 0).sum()) - len(every),
         without_height=int(np.isnan(fixes.rows[every[np.isin(fixes.stamps_ns[every], stamps)], 2]).sum()),

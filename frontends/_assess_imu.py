@@ -183,6 +183,26 @@ def turned_as_its_heading(imu: ImuReport, compasses: Sequence[CompassReport]) ->
     return replace(imu, mount=replace(imu.mount, rpy_deg=rpy, evidence=said, yaw_told=True))
 
 
+def turned_as_headed(
+    imu: TopicData, report: ImuReport, evidence: ImuEvidence, headed: Sequence[MeasuredMotion]
+) -> ImuReport:
+    """Return the report with the mount turned where the courses do not tell its yaw, but headings do: of a craft that goes ahead and astern.
+
+    Args:
+        headed: how the craft moved, with where it headed.
+    """
+    if report.mount.yaw_told or not headed:
+        return report
+    in_body = _Samples(imu.frame_id, *_in_body(_series_of(imu, report), report, evidence))
+    yaw, sigma, said = _mount_yaw(in_body, headed)
+    if yaw is None:
+        return report
+    R = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ rotation_from_rpy_deg(np.array(report.mount.rpy_deg))
+    rpy = vec(np.round(np.degrees(rpy_from_rotation(R)), 1) + 0.0)
+    told = f"{report.mount.evidence}; but from there {said}"
+    return replace(report, mount=replace(report.mount, rpy_deg=rpy, evidence=told, yaw_told=True, yaw_sigma_deg=sigma))
+
+
 def _level(axis: Array) -> Array:
     """Return the smallest rotation (3, 3) that takes a unit vector to +z; of a sensor on its head, after half a turn about x.
 
@@ -240,6 +260,14 @@ def inertial_of(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> Ine
     series = _series_of(imu, report)
     gravity_mps2 = 0.0 if report.gravity == "removed" else STANDARD_GRAVITY_MPS2
     return Inertial(Felt.of(*_in_body(series, report, evidence), gravity_mps2), series)
+
+
+def feels_motion(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> bool:
+    """Return whether an IMU whose mount is known or guessed clearly feels how the craft moves, whichever way its mount is turned, or turns as it does."""
+    if _against_courses(imu, report, evidence) > 0:
+        return True
+    found = yaw_in_craft(*_in_body(_series_of(imu, report), report, evidence), evidence.motions)
+    return found is not None and found.clear
 
 
 def _turning_of(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> Turning:

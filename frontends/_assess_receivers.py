@@ -18,6 +18,8 @@ from graphloc.signals.frozen_receiver import frozen_fixes
 from graphloc.signals.series import interpolated
 from graphloc.time import NS_PER_S
 
+TWO_CRAFT_M = 50.0
+"""By which two receivers wander against each other, from which they may be of two craft."""
 _FEWEST, _LAG_S = 20, 0.1
 _NEVER_NEAR = 0.5  # of the RMS distance; of errors alone the 5 % point is 0.23 of it (Rayleigh)
 _LONGEST_M = 400.0  # of a craft
@@ -114,7 +116,7 @@ def height_wanders_m(gnss: GnssReport) -> float | None:
 
 def apart_warning(gnss: GnssReport) -> str:
     """Return a line on a receiver that differs from another one."""
-    return (
-        f"{gnss.topic} and {gnss.apart_from} wander against each other by {gnss.apart_m:.1f} m (1 sigma of an axis): one of them is worse "
-        "than it says; the draft's slow_error covers it; compare runs with either one enabled"
-    )
+    said = "one of them is worse than it says; the draft's slow_error covers it; compare runs with either one enabled"
+    if gnss.apart_m >= TWO_CRAFT_M:
+        said = "they may be of two craft, or one of a base station: see that the one that is enabled is this vessel's"
+    return f"{gnss.topic} and {gnss.apart_from} wander against each other by {gnss.apart_m:.1f} m (1 sigma of an axis): {said}"

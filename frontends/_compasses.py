@@ -7,22 +7,31 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from graphloc.frames import wrap_angle
-from graphloc.frontends._assess import Courses
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from graphloc.frames import Array, wrap_angle
+from graphloc.frontends._assess import Courses, MeasuredMotion
 from graphloc.frontends._assess_compass import compass_report, headings, in_enu, says_the_same
 from graphloc.frontends._assess_imu import Inertial
 from graphloc.frontends._contents import Contents
 from graphloc.frontends._receivers import Late, receiver_of
-from graphloc.frontends._reports import CompassReport, filtered
+from graphloc.frontends._reports import CompassReport, ImuReport, filtered
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
 from graphloc.frontends.decode import IMU, NUMBERS, QUATERNION
 from graphloc.frontends.time_offsets import heading_time_offset
-from graphloc.frontends.turning import Turning
-from graphloc.measurements import CompassHeading, ImuSeries
+from graphloc.frontends.turning import Turning, against_turning
+from graphloc.measurements import CompassHeading
+from graphloc.signals.series import runs
 from graphloc.time import NS_PER_S
 
 _NONE: Late = {}
+_FEWEST = 20  # places
+_NO_HEADING_DEG = 20.0  # of wander within a minute, from which the motion tells the heading better; a choice
+_HELD_RAD = np.radians(5.0)  # of a turn, from which no compass says the same
+_OWN_NORTH_DEG = 20.0  # off a quarter turn: more than declination and leeway are in most places
 
 
 class _Heading(NamedTuple):
@@ -44,7 +53,7 @@ def compasses_of(
     candidates = bag.of_type(QUATERNION, IMU, *NUMBERS)
     timed = (_timed(s, courses, turning, together.get(receiver_of(s.topic))) for s in candidates)
     found = _without_echoes([heading for heading in timed if heading])
-    return tuple(_beside_gyro(heading, best.series) if best else heading.report for heading in found)
+    return tuple(_beside_gyro(heading, best) if best else heading.report for heading in found)
 
 
 def _timed(
@@ -89,8 +98,12 @@ def _without_echoes(compasses: Sequence[_Heading]) -> list[_Heading]:
     return found
 
 
-def _beside_gyro(heading: _Heading, series: ImuSeries) -> CompassReport:
-    """Return the report with the wander and the number of scattered headings, both relative to the gyroscope of the best IMU."""
+def _beside_gyro(heading: _Heading, best: Inertial) -> CompassReport:
+    """Return the report with the wander and the number of scattered headings, both relative to the gyroscope of the best IMU.
+
+    What wanders too far, though on the whole it turns as the gyroscope does, is no heading: a course over ground follows the vessel where it is
+    set, and looks anywhere while it stands. A compass that hangs for a while is one.
+    """
     report, stream = heading
     if not report.usable:
         return report
@@ -99,6 +112,53 @@ def _beside_gyro(heading: _Heading, series: ImuSeries) -> CompassReport:
         CompassHeading(stamp_ns=int(s), sensor=stream.topic, seq=0, yaw_rad=float(y), sigma_rad=1.0)
         for s, y in zip(stamps, wrap_angle(in_enu(angle, report.convention)), strict=True)
     ]
-    report = replace(report, wander_deg=wander_deg(series, measured))
-    bad = int(scattered(series, measured).sum())
-    return replace(report, why=f"{report.why}; {bad} of {len(measured)}: {SCATTERED}") if bad else report
+    bad, wander = scattered(best.series, measured), wander_deg(best.series, measured)
+    report = replace(report, wander_deg=wander)
+    left_out = bad | _held(best.felt.turning, stamps, angle)
+    most = [m for m, off in zip(measured, left_out, strict=True) if not off]
+    steady_deg = min(wander or 0.0, wander_deg(best.series, most) or 0.0)
+    if steady_deg > _NO_HEADING_DEG and against_turning(best.felt.turning, stamps, angle):
+        why = f"it wanders by {steady_deg:.0f} deg (1 sigma) beside the integrated gyro, as a course over ground does, which is no heading"
+        return replace(report, usable=False, why=why)
+    return replace(report, why=f"{report.why}; {bad.sum()} of {len(measured)}: {SCATTERED}") if bad.any() else report
+
+
+def _held(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> NDArray[np.bool_]:
+    """Return (N,) which headings repeat the one before them while the craft turns away from it."""
+    turned = np.interp((stamps_ns - turning.origin_ns) / NS_PER_S, turning.t_s, turning.turned_rad)
+    held = np.append(False, np.diff(angle) == 0.0)
+    for first, after in runs(held):
+        held[first:after] &= np.ptp(turned[first - 1 : after]) > _HELD_RAD
+    return held
+
+
+def with_own_north(compass: CompassReport, imus: Sequence[ImuReport]) -> CompassReport:
+    """Return the report, `drifts` where an IMU's own orientation counts from where it was switched on, as one without a magnetometer does.
+
+    Where north is counted from, the course is off its yaw by as much as x of the IMU is turned in the craft, or by a quarter turn more where
+    it counts from north.
+    """
+    own = next((imu for imu in imus if imu.topic == compass.topic), None)
+    if own is None or not compass.usable or compass.offset_deg is None or compass.two_antennas:
+        return compass
+    x_deg = own.mount.rpy_deg[2] if own.mount.yaw_told else 0.0
+    off_deg = compass.offset_deg - x_deg
+    return replace(compass, drifts=abs(off_deg - 90.0 * round(off_deg / 90.0)) > _OWN_NORTH_DEG)
+
+
+def headed(motion: MeasuredMotion, compass: CompassReport, stream: TopicData) -> MeasuredMotion | None:
+    """Return a motion with where the craft heads, by a compass as it is drafted, while that tells; None of a few places.
+
+    Courses tell it only of a craft that goes ahead, not of a ferry with two bows.
+    """
+    late_ns = round(compass.late_s[0] * NS_PER_S) if compass.late_s else 0
+    stamps, angle = headings(stream)
+    yaw = in_enu(angle, compass.convention) - np.radians(compass.turned_deg)
+    t_s = (stamps + late_ns - motion.origin_ns) / NS_PER_S
+    inside = (motion.t_s >= t_s[0]) & (motion.t_s <= t_s[-1])
+    if motion.way_m is None or inside.sum() < _FEWEST:
+        return None
+    at_s = motion.t_s[inside]
+    attitude = Rotation.from_euler("z", np.interp(at_s, t_s, yaw)[:, None])
+    kept = {"t_s": at_s, "speed_mps": motion.speed_mps[inside], "way_m": motion.way_m[inside]}
+    return replace(motion, source=f"{motion.source} beside the heading of {compass.topic}", attitude=attitude, **kept)

@@ -15,6 +15,7 @@ from graphloc.frontends._draft_receivers import receiver_blocks
 from graphloc.frontends._draft_scanners import scanner_blocks
 from graphloc.frontends._draft_velocities import velocity_blocks, wheels_block
 from graphloc.frontends._reports import (
+    TURNED_DEG,
     CompassReport,
     ImuReport,
     Inspection,
@@ -29,8 +30,11 @@ from graphloc.frontends.decode import IMU, POINT
 _MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
 # Wander of a compass from which it is drafted, and times what is usual: the comparison itself shows 0.6 deg in heavy waves.
 _WANDER_DEG, _LARGER = 0.7, 1.4
-_TURNED_DEG = 10.0  # off the course, from which a compass is taken for turned in the craft
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
+_DRIFTS = (
+    10.0,
+    600.0,
+)  # wander, deg, and its time, s, of a yaw without a north: cheap ones drift by a degree in half a minute; a choice
 _UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
 
@@ -147,7 +151,7 @@ def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
         why = (
             reason
             if imu.missing
-            else "one IMU is used: a whole one, with gravity in it, and with least gyro noise, of about equal ones that whose mount tf or the motion tells"
+            else "one IMU is used: a whole one, with gravity in it, that feels how the vessel moves, and with least gyro noise, of about equal ones that whose mount tf or the motion tells"
         )
         lines.append(f"  enabled: false  # guess: {why}")
     if imu.accel_unit != "m/s^2":
@@ -222,7 +226,13 @@ def _error_lines(compass: CompassReport) -> list[str]:
         why = "passing errors near iron; 0.2 for a GNSS compass"
     if wander > max(_WANDER_DEG, _LARGER * usual):
         usual, why = wander, "as it wanders beside the gyro; iron near it, or its own filter"
-    return [*lines, f"  wander_sigma_deg: {usual:.1f}  # guess: {why}"]
+    if compass.drifts:
+        usual, why = (
+            max(_DRIFTS[0], usual),
+            "its north is its own, as without a magnetometer: it drifts; 0.5 if it is magnetic",
+        )
+    lines.append(f"  wander_sigma_deg: {usual:.1f}  # guess: {why}")
+    return [*lines, f"  wander_time_constant_s: {_DRIFTS[1]:.0f}  # guess: likewise"] if compass.drifts else lines
 
 
 def _mount_lines(compass: CompassReport) -> list[str]:
@@ -232,12 +242,11 @@ def _mount_lines(compass: CompassReport) -> list[str]:
         return [f"  mount_offset_sigma_deg: {_UNKNOWN_DEG:.1f}  # guess: {said}"]
     lines = []
     sigma, why = abs(compass.offset_deg), "as far as it is off the GNSS course"
-    if sigma > _TURNED_DEG:
-        quarter = 90.0 * round(compass.offset_deg / 90.0)
-        rest = abs(compass.offset_deg - quarter)
-        # Of a vessel that is set sideways by turns, the mean course is no better than that.
-        askew = round(compass.offset_deg), max(_LEEWAY_DEG, compass.scatter_deg or 0.0)
-        yaw, sigma = (quarter, rest) if rest < 15.0 else askew
+    if sigma > TURNED_DEG:
+        yaw = compass.turned_deg
+        sigma = abs(compass.offset_deg - yaw)
+        if yaw % 90.0:  # of a vessel that is set sideways by turns, the mean course is no better than that
+            sigma = max(_LEEWAY_DEG, compass.scatter_deg or 0.0)
         why = "the course differs from the heading by leeway, so it shows no more than that"
         astern = ", unless the vessel goes astern most of the time: then 0" if compass.backwards else ""
         lines.append(

@@ -37,7 +37,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         share = 100.0 * gnss.by_turns[0].share
         lines.append(f"  fixes: rtk  # guess: {share:.0f} % of the fixes; the rest is {name}_other's")
     if not enabled:
-        why = (
+        why = gnss.elsewhere or (
             FILTERED
             if filtered(gnss.topic)
             else "one receiver is used: RTK throughout, else the most accurate by its claims and the drift of its height, of equal ones that with heights, then with most fixes"

@@ -167,6 +167,8 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         f"  track {gnss.travelled_m:.0f} m in a box of {east_m:.0f} x {north_m:.0f} m"
         + ("" if flat else f", height {gnss.height_range_m:.1f} m"),
     ]
+    if gnss.elsewhere:
+        lines.append(f"  not used: {gnss.elsewhere}")
     if gnss.without_place:
         lines.append(f"  {gnss.without_place} fixes lie at 0, 0, are NaN or beyond 90 and 180 deg, and are not used")
     if gnss.without_height:

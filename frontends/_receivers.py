@@ -20,24 +20,35 @@ from graphloc.frontends.time_offsets import MotionOffset, later_than
 
 Late = Mapping[str, tuple[float, float]]
 """How late the stamps of the fixes are, s, and 1 sigma, by receiver (`receiver_of`)."""
+_NONE: Mapping[str, str] = {}
 _FAR_BEYOND = 3.0  # times as far as another one's height wanders
 _SAME_M = 0.05  # by which two topics of one receiver wander against each other at most
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 # Of the run, from which a receiver is there throughout; of the fixes, from which it says as much as another.
 _COVERS = 0.8
+_ROAMS_M, _STAYS = (
+    50.0,
+    0.05,
+)  # from which a receiver goes about; as a share of that, within which another one stays where it is
 
 
-def receivers_of(bag: Contents) -> list[GnssReport]:
-    """Report the receivers, the best one first."""
+def receivers_of(bag: Contents, elsewhere: Mapping[str, str] = _NONE) -> list[GnssReport]:
+    """Report the receivers, the best one first.
+
+    Args:
+        elsewhere: why a receiver, by topic, is not of this craft.
+    """
     found = [r for s in bag.of_type(*FIX_TYPES) if (r := gnss_report(bag.streams[s.topic], bag.tf_frame(s)))]
+    found = [replace(r, elsewhere=elsewhere.get(r.topic, "")) for r in found]
     longest_s = max((r.spans_s for r in found), default=0.0)
-    rivals = [r for r in found if r.spans_s >= _COVERS * longest_s and not filtered(r.topic)]
+    rivals = [r for r in found if r.spans_s >= _COVERS * longest_s and not filtered(r.topic) and not r.elsewhere]
     most = max((r.fixes for r in rivals), default=0)
     level_m = min((m for r in rivals if (m := height_wanders_m(r)) is not None), default=0.0)
     heights_m = {receiver_of(r.topic): m for r in found if (m := height_wanders_m(r)) is not None}
     claimed = any(r.reported_sigma_m for r in rivals)
     found.sort(
         key=lambda r: (
+            bool(r.elsewhere),
             filtered(r.topic),
             r.spans_s < _COVERS * longest_s,
             r.slow_error,
@@ -48,7 +59,7 @@ def receivers_of(bag: Contents) -> list[GnssReport]:
             r.without_height,
         )
     )
-    return [_beside_others(report, rivals, bag) for report in found]
+    return [report if report.elsewhere else _beside_others(report, rivals, bag) for report in found]
 
 
 def receiver_of(topic: str) -> str:

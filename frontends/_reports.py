@@ -18,6 +18,9 @@ Vec = tuple[float, float, float]
 # HDT and THS of a GNSS receiver; topics of ublox_gps, septentrio_gnss_driver, mavros and their like.
 _TWO_ANTENNAS = re.compile(r"[ +]G[A-Z](HDT|THS)$|gps|gnss|nav_?heading|rel_?pos|dual|moving_?bas", re.IGNORECASE)
 _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
+TURNED_DEG = 10.0
+"""Off the course, from which a compass is taken for turned in the craft."""
+_ASKEW_DEG = 15.0  # off a quarter turn, from which it sits askew
 _ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset of its compass as well
 _DIFFERS = 1.5  # times the default of a slow error
 # Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
@@ -189,6 +192,7 @@ class GnssReport:
         by_turns: the fixes of RTK, by their status and what they state, and the others, where both come.
         without_place: fixes that state none: NaN, 0, 0, or beyond 90 and 180 deg.
         without_height: fixes without one. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
+        roams_m: diagonal of the box, 10 % to 90 %, of the places. elsewhere: why it is not of this craft, beside another one; '' where it may be.
     """
 
     topic: str
@@ -222,6 +226,8 @@ class GnssReport:
     apart_from: str = ""
     keeps_m: float = 0.0
     by_turns: tuple[PartOfFixes, PartOfFixes] | None = None
+    roams_m: float = 0.0
+    elsewhere: str = ""
 
     @property
     def rtk_sigma_m(self) -> tuple[float, float] | None:
@@ -253,6 +259,7 @@ class CompassReport:
         two_antennas: whether a GNSS receiver says it, by its sentence, its topic, or as an Imu with an orientation alone.
         late_s: what should be added to its stamps by the gyroscope, s, and 1 sigma; None where that does not tell. What is said above is
             of corrected stamps. late_with_fixes: not the gyroscope tells it, but the fixes of the same messages.
+        drifts: whether its north is its own, so that it drifts as a gyroscope does.
     """
 
     topic: str
@@ -270,11 +277,20 @@ class CompassReport:
     two_antennas: bool = False
     late_s: tuple[float, float] | None = None
     late_with_fixes: bool = False
+    drifts: bool = False
 
     @property
     def ahead(self) -> bool:
         """Whether it is that of the course, nearly."""
         return self.usable and self.offset_deg is not None and abs(self.offset_deg) < 180.0 - _ASTERN_DEG
+
+    @property
+    def turned_deg(self) -> float:
+        """By how much it is taken to be turned in the craft: by quarters, unless the course says otherwise; 0 where leeway explains that, or nothing tells."""
+        if self.offset_deg is None or abs(self.offset_deg) <= TURNED_DEG:
+            return 0.0
+        quarter = 90.0 * round(self.offset_deg / 90.0)
+        return quarter if abs(self.offset_deg - quarter) < _ASKEW_DEG else float(round(self.offset_deg))
 
     @property
     def backwards(self) -> bool:

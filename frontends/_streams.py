@@ -178,6 +178,7 @@ class TopicData:
 
     recorded: whether the stamps are recording times, because the headers hold none, or whole seconds only.
     broken: why the first message that cannot be decoded is that.
+    frames: how many messages name each frame_id.
     part: what it is of a maker's message; None of other messages. filtered: how many of these a filter made, by what they say.
     drift_ppm: by how much the clock ran fast; what it gained is taken off the stamps. elapsed: (N,) ns from the beginning of the bag.
     """
@@ -192,6 +193,7 @@ class TopicData:
     drift_ppm: float = 0.0
     part: Part | None = None
     filtered: int = 0
+    frames: Counter[str] = field(default_factory=Counter)
     _stamps: list[int] = field(default_factory=list)
     _logs: list[int] = field(default_factory=list)
     tuples: list[tuple[float, ...]] = field(default_factory=list)
@@ -424,7 +426,9 @@ def _add(stream: TopicData, row: Row | None, raw: RawMessage, msg: Any) -> None:
     stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns)
     if raw.msgtype not in UNSTAMPED:
         header = getattr(msg, "header", None)
-        stream.frame_id = stream.frame_id or str(getattr(header, "frame_id", "")).lstrip("/")
+        frame_id = str(getattr(header, "frame_id", "")).lstrip("/")
+        stream.frame_id = stream.frame_id or frame_id
+        stream.frames[frame_id] += 1
     stream.add(stamp_ns or 0, raw.log_ns, row, raw.file, raw.elapsed_ns)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag lacks, and topics of IMUs, receivers, magnetometers and speeds in it that are not used, with reasons."""
+"""What a bag lacks, topics of IMUs, receivers, magnetometers and speeds in it that are not used, with reasons, and those that sensors share."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from graphloc.frontends.source import TopicSummary
 
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
 _MOST_NAMED = 6
+_SHARE = 0.05  # of the messages of a topic, above which what they name is no mistake
 _MAGNETIC = "sensor_msgs/msg/MagneticField"
 # Packets and clouds in a maker's own types, and scans of a plane; lists of tags other than `LISTS`.
 _LIDAR = re.compile(r"LaserScan|livox|velodyne|ouster|pandar|hesai|rslidar|robosense|lidar", re.IGNORECASE)
@@ -88,6 +89,21 @@ def unused_topics(streams: Sequence[TopicData], used: Container[str], messages: 
             else f"{stream.topic}: not a message on it"
         )
     return lines
+
+
+def shared_topics(streams: Sequence[TopicData]) -> list[str]:
+    """Return a line for each topic on which several sensors are, by the frames that its messages name."""
+    lines = {}
+    for stream in streams:
+        topic = bare_topic(stream.topic)
+        said = {frame: n for frame, n in stream.frames.most_common() if n > _SHARE * stream.frames.total()}
+        if len(said) > 1:
+            names = ", ".join(f"{frame or 'none'} {n}" for frame, n in said.items())
+            lines[topic] = (
+                f"{topic}: its messages name several frames ({names}): they are of several sensors, and taken for those of one; let each driver "
+                "write to a topic of its own"
+            )
+    return list(lines.values())
 
 
 def unused_magnetometers(topics: Iterable[TopicSummary]) -> list[str]:

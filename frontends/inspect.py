@@ -21,11 +21,19 @@ from graphloc.frontends._assess import (
     track,
     vec,
 )
-from graphloc.frontends._assess_imu import ImuEvidence, Inertial, imu_report, inertial_of, turned_as_its_heading
-from graphloc.frontends._assess_receivers import apart_warning
+from graphloc.frontends._assess_imu import (
+    ImuEvidence,
+    Inertial,
+    feels_motion,
+    imu_report,
+    inertial_of,
+    turned_as_headed,
+    turned_as_its_heading,
+)
+from graphloc.frontends._assess_receivers import TWO_CRAFT_M, apart_warning
 from graphloc.frontends._assess_velocity import motion_of_poses, motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of
-from graphloc.frontends._compasses import compasses_of
+from graphloc.frontends._compasses import compasses_of, headed, with_own_north
 from graphloc.frontends._contents import Contents, contents_of
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
@@ -51,6 +59,7 @@ from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import Pose
 from graphloc.frontends._unused import (
     lacking,
+    shared_topics,
     unread_lidars,
     unread_tags,
     unused_magnetometers,
@@ -82,6 +91,7 @@ _AS_NOISY = 1.5  # gyro noise, times that of the least noisy IMU, up to which on
 _DOWN = np.diag([1.0, -1.0, -1.0])  # to axes ahead, to port, up from such ahead, to starboard, down
 _BELOW_M, _ALIKE = 0.05, 0.9  # antennas in tf, from which its z points down; cosine between axes taken for the same
 _FEWEST = 20  # places of a track
+_STAYS = 0.05  # as a share of the way of a receiver, within which another one stays where it is
 
 
 def inspect_bag(bags: Bags | Bag) -> Inspection:
@@ -98,6 +108,8 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     """
     bag = contents_of(bags)
     gnss = receivers_of(bag)
+    if elsewhere := _elsewhere(bag, gnss):
+        gnss = receivers_of(bag, elsewhere)
     reference = _best_track(bag, gnss)
     odometry = _odometry_reports(bag, gnss, reference)
     velocities = _velocity_reports(bag, reference)
@@ -107,7 +119,10 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     imus, in_body = _in_axes_up(bag, gnss, _imu_reports(bag, evidence))
     best = _best_imu(bag, imus, evidence)
     compasses = compasses_of(bag, courses, best)
-    taken, imus = imus, [turned_as_its_heading(imu, compasses) for imu in imus]
+    taken, imus = (
+        imus,
+        [turned_as_its_heading(imu, compasses) for imu in _beside_headings(bag, imus, evidence, compasses)],
+    )
     if imus and imus[0] is not taken[0]:
         best = _best_imu(bag, imus, evidence)
     velocities = [(s, with_side(report, s, best.felt if best else None)) for s, report in velocities]
@@ -122,7 +137,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
         topics=_topic_reports(bag),
         imus=tuple(imus),
         gnss=_with_wander(bag, timed, odometry, velocities, motions),
-        compasses=compasses,
+        compasses=tuple(with_own_north(compass, imus) for compass in compasses),
         odometry=tuple(reports),
         velocities=tuple(timed_velocity(report, late.get(report.topic), together) for _, report in velocities),
         lidars=lidars_of(bag),
@@ -132,6 +147,37 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
         in_body=in_body,
         warnings=(*bag.warnings, *_warnings(bag, gnss, imus, compasses, reports)),
     )
+
+
+def _elsewhere(bag: Contents, gnss: Sequence[GnssReport]) -> dict[str, str]:
+    """Return why receivers are not of this craft, by topic: the best IMU feels nothing of how they move, but of how another one does, far from them."""
+    farthest_m = max((report.roams_m for report in gnss), default=0.0)
+
+    def stays(report: GnssReport) -> bool:
+        return report.roams_m < _STAYS * farthest_m and farthest_m >= TWO_CRAFT_M
+
+    if not gnss or not (gnss[0].apart_m >= TWO_CRAFT_M or stays(gnss[0])):
+        return {}
+    motions = motions_of((), (), bag.of_type(*FIX_TYPES))
+    imus = _imu_reports(bag, ImuEvidence(motions, None, bag.tree))
+
+    def felt(report: GnssReport) -> bool:
+        reference = _best_track(bag, [report])
+        own = [motion for motion in motions if motion.source == report.topic]
+        evidence = ImuEvidence(own, courses_of(reference) if len(reference.stamps_ns) else None, bag.tree)
+        return bool(imus) and feels_motion(bag.aligned[imus[0].topic], imus[0], evidence)
+
+    unfelt = {report.topic for report in gnss if not felt(report)}
+    aboard = next((report for report in gnss if report.topic not in unfelt), None)
+    if aboard is None or aboard is gnss[0]:
+        return {}
+    why = f"{imus[0].topic} feels how {aboard.topic} moves, and nothing of how this one does: of another craft"
+    base = f"while {aboard.topic} goes {aboard.roams_m:.0f} m, as {imus[0].topic} feels: a base station ashore, or a receiver that hangs"
+    return {
+        report.topic: f"it stays within {report.roams_m:.2f} m {base}" if stays(report) else why
+        for report in gnss
+        if report.topic in unfelt and (report.apart_m >= TWO_CRAFT_M or stays(report))
+    }
 
 
 def _topic_reports(bag: Contents) -> tuple[TopicReport, ...]:
@@ -213,11 +259,15 @@ def _motions(
 
 
 def _imu_reports(bag: Contents, evidence: ImuEvidence) -> list[ImuReport]:
-    """Report the IMUs: whole ones with gravity in them first, the least noisy ones first; of those about as noisy, one whose mount tf or the motion tells."""
-    imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, evidence))]
+    """Report the IMUs: whole ones with gravity in them first, of these any that feel how the craft moves, the least noisy ones first; of those about as noisy, one whose mount tf or the motion tells.
 
-    def kind(imu: ImuReport) -> tuple[bool, bool]:
-        return bool(imu.missing), imu.gravity == "removed"
+    One that feels nothing of what another one feels turns on its own: that of a stabilised camera.
+    """
+    imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, evidence))]
+    moved = {imu.topic for imu in imus if len(imus) > 1 and feels_motion(bag.aligned[imu.topic], imu, evidence)}
+
+    def kind(imu: ImuReport) -> tuple[bool, bool, bool]:
+        return bool(imu.missing), imu.gravity == "removed", imu.topic not in moved
 
     def key(imu: ImuReport) -> tuple[object, ...]:
         least = min(other.gyro_noise_mdps for other in imus if kind(other) == kind(imu))
@@ -230,6 +280,21 @@ def _imu_reports(bag: Contents, evidence: ImuEvidence) -> list[ImuReport]:
 
 def _best_imu(bag: Contents, imus: Sequence[ImuReport], evidence: ImuEvidence) -> Inertial | None:
     return inertial_of(bag.aligned[imus[0].topic], imus[0], evidence) if imus else None
+
+
+def _beside_headings(
+    bag: Contents, imus: Sequence[ImuReport], evidence: ImuEvidence, compasses: Sequence[CompassReport]
+) -> list[ImuReport]:
+    """Return the reports with the yaw of mounts that the first compass tells which is no IMU's own and knows north."""
+    known = (
+        c for c in compasses if c.usable and c.offset_deg is not None and c.topic not in {imu.topic for imu in imus}
+    )
+    compass = next(known, None)
+    if compass is None:
+        return list(imus)
+    moved = (headed(motion, compass, bag.aligned[compass.topic]) for motion in evidence.motions)
+    told = [motion for motion in moved if motion]
+    return [turned_as_headed(bag.aligned[imu.topic], imu, evidence, told) for imu in imus]
 
 
 def _in_axes_up(
@@ -300,9 +365,10 @@ def _warnings(
     usable = {c.topic for c in compasses if c.usable}
     for report in gnss:
         yield from filter(None, (report.stored, report.frozen, report.in_radians))
-    if gnss and gnss[0].differs:
+    if gnss and (gnss[0].differs or gnss[0].apart_m >= TWO_CRAFT_M):
         yield apart_warning(gnss[0])
     used = {g.topic for g in gnss} | {i.topic for i in imus} | usable
+    yield from shared_topics(list(bag.streams.values()))
     yield from unused_topics(list(bag.streams.values()), used, sum(t.messages for t in topics))
     yield from lacking(bag, imus, gnss, odometry)
     if not bag.lidars:

@@ -488,6 +488,143 @@ def drift(t: Array, _yaw: Array) -> Array:
     return np.asarray(error / error.std(axis=0) * [4.0, 4.0, 8.0])
 
 
+def test_the_fix_of_a_base_ashore_is_not_the_vessels(tmp_path: Path) -> None:
+    """Of a centimetre, and that of the vessel of 0.3 m: it was taken for the receiver, its antenna for 55 m off the mount, and the vessel stood still."""
+    make = Messages(2)
+    items = drive(make, status=0, sigma_m=0.5, seconds=60, noise_m=0.3)
+    for k in range(60):
+        at = START_NS + k * S
+        items.append(
+            ("/base/fix", at, make.fix(at, 58.001, 11.002, 44.0 + 1e-4 * (k % 7), 2, 1e-4 * np.eye(3).ravel()))
+        )
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == ["/fix"]
+    assert {s.mount_sigma_m for s in config.of_kind("gnss").values()} == {1.0}
+    assert "a base station ashore" in text
+
+
+@pytest.mark.parametrize("moored", [False, True])
+def test_the_receiver_of_another_craft_is_not_the_vessels(moored: bool, tmp_path: Path) -> None:
+    """A target's RTK, better than the own receiver, was taken for it. Where the IMU feels neither, as of a vessel that lies moored, a line says so."""
+    make = Messages(2)
+    items = drive(make, status=0, sigma_m=0.5, seconds=60, noise_m=0.3)
+    for k in range(300):
+        at, a = START_NS + k * S // 5, 0.03 * k
+        lat, lon, up = DATUM.geodetic_from_enu(np.array([[300.0 * np.sin(a), 300.0 * np.cos(0.7 * a), 0.0]]))[0]
+        items.append(("/target/fix", at, make.fix(at, lat, lon, up, 2, 1e-4 * np.eye(3).ravel())))
+    if moored:
+        place = next(m for topic, _, m in items if topic == "/fix")
+        for topic, at, m in items:
+            if topic == "/fix":
+                m.latitude, m.longitude = place.latitude + 1e-6 * (at // S % 7), place.longitude
+            elif topic == "/imu":
+                m.linear_acceleration.x = m.linear_acceleration.y = m.angular_velocity.z = 1e-3 * (at // 10**7 % 5)
+    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert any("two craft" in line for line in found.warnings) == moored
+    assert ("of another craft" in text) == (not moored)
+    assert moored or [s.topic for s in config.of_kind("gnss").values() if s.enabled] == ["/fix"]
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_sensors_that_share_a_topic_are_named(shared: bool, tmp_path: Path) -> None:
+    """Of antennas 20 m apart the track was, online, 5 m off, and inside its bounds 80 % of the time, without a line on the cause."""
+    make = Messages(2)
+    items = drive(make, status=0, sigma_m=0.5, seconds=30)
+    for k, m in enumerate(m for topic, _, m in items if topic == "/fix"):
+        m.header.frame_id = "stern" if shared and k % 2 else "bow"
+    found, _, _ = look(tmp_path, items, make)
+    assert any("/fix: its messages name several frames (bow" in line for line in found.warnings) == shared
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 90.0, 180.0])
+def test_a_compass_tells_how_the_imu_of_a_ferry_with_two_bows_is_turned(turned_deg: float, tmp_path: Path) -> None:
+    """It goes astern for half of the time, where its course is no heading: the mount was taken as not turned, and the heading 88 deg off."""
+    make, rng = Messages(2), np.random.default_rng(7)
+    t = np.arange(0.0, 90.0, 0.02)
+    speed, rate = 3.0 * np.sin(0.25 * t), 0.06 * np.sin(0.1 * t)
+    yaw = 0.4 + np.cumsum(rate) * 0.02
+    east, north = (np.cumsum(speed * f(yaw)) * 0.02 for f in (np.cos, np.sin))
+    R = Rotation.from_euler("z", turned_deg, degrees=True).as_matrix()
+    accel = np.column_stack([np.gradient(speed, 0.02), speed * rate, np.full(len(t), G)]) + rng.normal(
+        0.0, 0.05, (len(t), 3)
+    )
+    lla = DATUM.geodetic_from_enu(np.column_stack([east, north, 0.0 * t]) + rng.normal(0.0, 0.1, (len(t), 3)))
+    items: list[Item] = []
+    for k, felt in enumerate((accel @ R).tolist()):
+        at = START_NS + k * S // 50
+        items.append(("/imu", at, make.imu(at, felt, (0.0, 0.0, rate[k] + 1e-3 * rng.normal()))))
+        if k % 10 == 0:
+            half = yaw[k] / 2.0
+            items.append(("/fix", at, make.fix(at, lla[k][0], lla[k][1], lla[k][2], 0, 0.25 * np.eye(3).ravel())))
+            items.append(("/compass", at, make.compass(at, (0.0, 0.0, np.sin(half), np.cos(half)))))
+    _, config, _ = look(tmp_path, items, make)
+    assert config.sensors["imu"].mount.rpy_deg == pytest.approx((0.0, 0.0, turned_deg))
+
+
+def test_the_imu_of_a_stabilised_camera_is_not_the_vessels(tmp_path: Path) -> None:
+    """It is less noisy, pans by itself, and feels nothing of the way of the craft: it was taken for the IMU, and the compass for one that wanders by 130 deg."""
+    make, rng = Messages(2), np.random.default_rng(5)
+    items = drive(make, seconds=60)
+    for k in range(60 * 50):
+        at, (up, noise) = START_NS + k * S // 50, 1e-4 * rng.normal(size=(2, 3))
+        up[2] += G
+        noise[2] += 0.5 * np.sin(0.02 * k)  # it pans
+        items.append(("/camera/imu", at, make.imu(at, up.tolist(), noise.tolist(), frame="camera")))
+    _, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert config.sensors["imu"].topic == "/imu"
+
+
+def test_a_course_over_ground_is_no_heading(tmp_path: Path) -> None:
+    """Of a vessel that is set about by a current: drafted as a compass that wanders by 43 deg, it drew the heading 34 deg off, online, out of its bounds."""
+    make = Messages(2)
+    items = drive(make, status=0, sigma_m=0.5, seconds=150, noise_m=0.1)
+    fixes = [(at, m) for topic, at, m in items if topic == "/fix"]
+    t = np.array([(at - START_NS) / S for at, _ in fixes])
+    set_m = 15.0 * np.column_stack([np.sin(t / 8.0), np.cos(t / 11.0), 0.0 * t])
+    p = DATUM.enu_from_geodetic(*np.array([(m.latitude, m.longitude, m.altitude) for _, m in fixes]).T) + set_m
+    items = [item for item in items if item[0] not in ("/fix", "/compass", "/wheel/odom")]
+    step = np.gradient(p, axis=0)
+    for (at, m), (lat, lon, up), (east, north, _) in zip(fixes, DATUM.geodetic_from_enu(p), step, strict=True):
+        half = np.arctan2(north, east) / 2.0
+        items.append(("/fix", at, make.fix(at, lat, lon, up, 0, m.position_covariance)))
+        items.append(("/gps/heading", at, make.compass(at, (0.0, 0.0, np.sin(half), np.cos(half)))))
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert not config.of_kind("compass")
+    assert "as a course over ground does" in text
+
+
+def test_a_compass_that_hangs_for_a_while_is_one(tmp_path: Path) -> None:
+    """Meanwhile the craft turns away from what it says, as from a course over ground."""
+    make, held = Messages(2), None
+    items = drive(make, status=0, sigma_m=0.5, seconds=120)
+    for topic, at, m in items:
+        if topic == "/compass" and 45.0 < (at - START_NS) / S < 65.0:
+            held = held or m.quaternion
+            m.quaternion = held
+    _, config, _ = look(tmp_path, items, make)
+    assert "compass" in config.sensors
+
+
+@pytest.mark.parametrize(("zero_deg", "drifts"), [(124.0, True), (90.0, False), (12.0, False)])
+def test_the_yaw_of_an_imu_without_a_north_drifts(zero_deg: float, *, drifts: bool, tmp_path: Path) -> None:
+    """It counts from where it was switched on: taken for a compass, its drift of 8 deg in 200 s left a third of the headings outside their bounds."""
+    make = Messages(2)
+    items = drive(make, status=0, sigma_m=0.5, seconds=60)
+    yaws = [(at, 2.0 * np.arctan2(m.quaternion.z, m.quaternion.w)) for topic, at, m in items if topic == "/compass"]
+    at_ns, yaw = np.array([at for at, _ in yaws]), np.unwrap([y for _, y in yaws])
+    for topic, at, m in items:
+        if topic == "/imu":
+            half = (np.pi / 2.0 - np.interp(at, at_ns, yaw) - np.radians(zero_deg)) / 2.0
+            m.orientation, m.orientation_covariance = (
+                make.quat((0.0, 0.0, np.sin(half), np.cos(half))),
+                np.eye(3).ravel(),
+            )
+    _, config, _ = look(tmp_path, [item for item in items if item[0] != "/compass"], make)
+    compass = config.sensors["compass"]
+    assert isinstance(compass, CompassConfig)
+    assert (compass.wander_sigma_deg >= 5.0) == drifts
+
+
 def test_of_two_receivers_the_one_whose_height_drifts_is_not_used(tmp_path: Path) -> None:
     """It claimed half of what the other did, was used, and its drift of 4 m went into the track without a word."""
     make = Messages(2)

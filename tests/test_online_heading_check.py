@@ -16,7 +16,9 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.factors import gnss, imu
 from graphloc.frames import Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.measurements import CompassHeading, GnssPosition
+from graphloc.online._frozen_receiver import FrozenReceiverDetector
 from graphloc.online._heading_check import HeadingCheck, _lever_m
+from graphloc.online._live import ReceiverDetectors
 from graphloc.recording import Recording
 from graphloc.replay import Replayed, replay
 from graphloc.solution import Health
@@ -113,11 +115,17 @@ def at_two_hertz() -> SimulatedRun:
 
 
 def said_of(
-    run: SimulatedRun, jump_s: tuple[float, float], turned_rad: float, before_ns: int = 0, late_ns: int = 0
+    run: SimulatedRun,
+    jump_s: tuple[float, float],
+    turned_rad: float,
+    before_ns: int = 0,
+    late_ns: int = 0,
+    hangs_s: tuple[float, float] = (0.0, 0.0),
 ) -> list[str]:
     """What is said of an estimate that is right but for its heading, where the fixes are 8 m further east for a while.
 
-    `before_ns`: stamp of a state before, by a clock that was then set back. `late_ns`: by how much the fixes are stamped late.
+    `before_ns`: stamp of a state before, by a clock that was then set back. `late_ns`: by how much the fixes are stamped late. `hangs_s`: when
+    the receiver repeats a fix.
     """
     datum, of_imu = app.choose_datum(run.recording, run.config), run.config.sensors["imu"].mount
     assert run.recording.imu is not None
@@ -129,19 +137,23 @@ def said_of(
     )
     lever = run.config.sensors["gnss"].mount.t_body_sensor_m - of_imu.t_body_sensor_m
     antenna = run.config.sensors["gnss"].model_copy(update={"stamp_sigma_s": 0.05 if late_ns else 0.0})
-    stream = SimpleNamespace(row=gnss.ROW, config=antenna, mount=gtsam.Pose3(gtsam.Rot3(), lever))
+    receiver = ReceiverDetectors()
+    stream = SimpleNamespace(
+        row=gnss.ROW, config=antenna, mount=gtsam.Pose3(gtsam.Rot3(), lever), receiver=receiver, frozen_detector=FrozenReceiverDetector()
+    )  # fmt: skip
     problem = SimpleNamespace(
         streams={"gnss": stream}, datum=datum, links=links, R_body_imu=of_imu.R_body_sensor, t_body_imu_m=of_imu.t_body_sensor_m
     )  # fmt: skip
     begin_ns = int(run.truth.stamps_ns[0])
     waiting = deque(replace(m, stamp_ns=m.stamp_ns + late_ns) for m in run.recording.of(GnssPosition))
-    check, said = HeadingCheck(), list[str]()
+    check, said, last = HeadingCheck(), list[str](), waiting[0]
     if before_ns:
         at_once: Any = SimpleNamespace(stamp_ns=before_ns)
         check.look(SimpleNamespace(first_ns=before_ns - SECOND // 5, problem=problem, newest=at_once))  # type: ignore[arg-type]
     stamps_ns = range(begin_ns + SECOND // 5, begin_ns + 69 * SECOND, SECOND // 5)
     at = run.truth.at(np.array(stamps_ns))
-    for stamp_ns, R, place_m in zip(stamps_ns, at.R_world_body, at.p_world_m, strict=True):
+    assert at.v_world_mps is not None
+    for stamp_ns, R, place_m, v_mps in zip(stamps_ns, at.R_world_body, at.p_world_m, at.v_world_mps, strict=True):
         pose = gtsam.Pose3(gtsam.Rot3.Yaw(turned_rad).compose(gtsam.Rot3(R)), place_m)
         newest = SimpleNamespace(
             stamp_ns=stamp_ns, pose=pose, pose_cov=1e-4 * np.eye(6), bias=gtsam.imuBias.ConstantBias()
@@ -152,6 +164,12 @@ def said_of(
             if jump_s[0] <= (m.stamp_ns - begin_ns) / SECOND < jump_s[1]:
                 lat, lon, height = m.position
                 m = replace(m, position=Geodetic(lat, lon + 8.0 / (111_320.0 * np.cos(np.radians(lat))), height))
+            since_s = (m.stamp_ns - begin_ns) / SECOND
+            if hangs_s[0] <= since_s < hangs_s[1]:
+                m = replace(m, position=last.position)
+            last = m
+            hint = gnss.ROW.hint(m, 0.0, datum)
+            receiver.repeated_fix.note(m.stamp_ns, hint.p_world_m[:2], (R.T @ v_mps)[:2], 0.1)
             check.note(m, lag)
         if check.look(lag):
             said.append(check.said)
@@ -173,6 +191,14 @@ def in_loops() -> SimulatedRun:
         path="loops", duration_s=70.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=0.0
     )
     return simulate(loops, 4)
+
+
+def test_a_receiver_that_hangs_neither_hides_a_wrong_heading_nor_makes_one(
+    at_two_hertz: SimulatedRun, in_loops: SimulatedRun
+) -> None:
+    """Its fixes had been rejected, and yet counted here: on a boat a heading right to 0.3 deg was said to be off by 171 deg."""
+    assert len(said_of(at_two_hertz, (0.0, 0.0), np.radians(70.0), hangs_s=(10.0, 25.0))) == 1
+    assert said_of(in_loops, (0.0, 0.0), 0.0, hangs_s=(30.0, 45.0)) == []
 
 
 def test_fixes_that_are_late_make_no_wrong_heading(in_loops: SimulatedRun) -> None:

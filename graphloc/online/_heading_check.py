@@ -109,12 +109,13 @@ class HeadingCheck:
         return self._fits >= _IN_A_ROW
 
     def note(self, m: Measurement, lag: Lag) -> None:
-        """Take in a position of the first GNSS receiver (any absolute sensor without hypotheses)."""
+        """Take in a position of the first GNSS receiver (any absolute sensor without hypotheses), unless it is frozen."""
         stream = lag.problem.streams.get(m.sensor)
         if (
             stream is None
             or not stream.row.absolute
             or stream.row.false is not None
+            or stream.frozen_detector.frozen
             or self._sensor not in ("", m.sensor)
         ):
             return
@@ -137,6 +138,9 @@ class HeadingCheck:
         self.looked_ns, self.within_rad = newest.stamp_ns, np.inf
         if self._sensor not in lag.problem.streams:
             return False
+        # That a receiver repeats a fix may turn out after it was noted.
+        repeated = lag.problem.streams[self._sensor].receiver.repeated_fix
+        self._fixes = deque(fix for fix in self._fixes if not repeated.is_old(fix.stamp_ns, fix.p_world_m))
         # Not with the estimated bias, which a guess has bent until it fits.
         fit = self._fit(lag, newest, np.zeros(3), any_place=guessed)
         self.within_rad = _within_rad(fit)
