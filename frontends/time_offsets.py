@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.special import stdtrit
 
 from graphloc.frames import Array
@@ -76,6 +78,21 @@ def _heading_step(turning: Turning, at: Array, angle: Array) -> tuple[float, flo
     return value, float(np.sqrt((len(up) - 1) / len(up) * ((without - without.mean()) ** 2).sum())), len(up)
 
 
+class _Windows(NamedTuple):
+    """Windows of one length in which a motion is compared with what is felt.
+
+    Attributes:
+        windows: how many are not alike. along: (N,) the motion's acceleration along its course, times the square of half the length.
+        begun: (B,) the first window of each block. second, first: of `_bending`.
+    """
+
+    windows: float
+    along: Array
+    begun: NDArray[np.int64]
+    second: Any
+    first: Any
+
+
 class MotionOffset(NamedTuple):
     """What should be added to the stamps of a motion, s, 1 sigma; `clear`: whether it is better than nothing by far."""
 
@@ -118,7 +135,7 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
     t, at = felt.t_s, felt.times_of(motion)
     # Where the right offset is farther than is looked, a lesser peak of the same motion takes its place, clearly.
     lags = np.arange(-FARTHEST_LATE_S, FARTHEST_LATE_S + 0.5 * _APART_S, _APART_S)
-    found: list[tuple[float, float, float]] = []
+    lengths = list[_Windows]()
     for half_s in windows_of(motion):
         margin = half_s + FARTHEST_LATE_S
         middle = np.arange(max(t[0], at[0]) + margin, min(t[-1], at[-1]) - margin, STEP_S)
@@ -131,19 +148,26 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
         along = (moved * np.conj(chord / np.maximum(np.abs(chord), MOVES_M)))[good].real
         block = (middle - middle[0]) // _BLOCK_S
         begun = np.flatnonzero(np.diff(block, prepend=-1.0))
-        felt_at = (_felt_along(felt, at, motion.speed_mps, middle, half_s, lag) for lag in lags)
-        sums = np.stack([_sums(along, own, swung, begun) for own, swung in felt_at])
+        lengths.append(_Windows(windows, along, begun, *_bending(at, middle, half_s)))
+    if not lengths:
+        return None
+    felt_at = (_felt_along(felt, at, motion.speed_mps, lengths, lag) for lag in lags)
+    sums_of = zip(*felt_at, strict=True)
+    found: list[tuple[float, float, float]] = []
+    for own, by_lag in zip(lengths, sums_of, strict=True):
+        sums = np.stack(by_lag)
         total = sums.sum(axis=1)
-        whole = _best_lag(total, lags, windows)
+        whole = _best_lag(total, lags, own.windows)
         if whole is None:
             continue
         better, value, sigma = whole
         # A jump of the fixes is an acceleration that some lag fits by chance; how much that tells differs from block to block.
-        if len(begun) > 2:
-            rest = (total - sums[:, k] for k in range(len(begun)))
-            without = [_best_lag(r, lags, windows * float(r[0, 0, 0]) / len(along)) for r in rest]
+        blocks = len(own.begun)
+        if blocks > 2:
+            rest = (total - sums[:, k] for k in range(blocks))
+            without = [_best_lag(r, lags, own.windows * float(r[0, 0, 0]) / len(own.along)) for r in rest]
             values = np.array([np.inf if one is None else one[1] for one in without])
-            scatter = np.sqrt((len(begun) - 1) * np.var(values)) if np.isfinite(values).all() else np.inf
+            scatter = np.sqrt((blocks - 1) * np.var(values)) if np.isfinite(values).all() else np.inf
             sigma = max(sigma, float(scatter))
         found.append((better, value, sigma))
     if not found:
@@ -198,21 +222,41 @@ def later_than(fixes: MeasuredMotion, velocity: MeasuredMotion) -> tuple[float, 
     return value, float(np.sqrt(0.5 * left / (power * windows)))
 
 
-def _felt_along(
-    felt: Felt, at_s: Array, speed_mps: Array, middle_s: Array, half_s: float, late_s: float
-) -> tuple[Array, Array]:
-    """Return the sensor's own acceleration along the course, and that of a place a metre above it by pitch alone, times the square of `half_s`.
+def _bending(at_s: Array, middle_s: Array, half_s: float) -> tuple[Any, Any]:
+    """Return the sparse matrices (N, M) that take places at M times to the second and the first difference of `bent` about N others.
+
+    They are the same for all lags: to look up anew between which places each time is, at each lag, took a tenth of the time of `inspect`.
+    """
+    at = middle_s[:, None] + half_s * np.array([-1.0, 0.0, 1.0])
+    before = np.clip(np.searchsorted(at_s, at, side="right") - 1, 0, len(at_s) - 2)
+    share = (at - at_s[before]) / (at_s[before + 1] - at_s[before])
+    near, share = np.stack([before, before + 1], axis=2), np.stack([1.0 - share, share], axis=2)
+
+    def combined(times: list[float]) -> Any:
+        weight, rows = share * np.array(times)[:, None], np.arange(len(middle_s) + 1) * 2 * len(times)
+        return csr_array((weight.ravel(), near.ravel(), rows), shape=(len(middle_s), len(at_s)))
+
+    return combined([1.0, -2.0, 1.0]), combined([-1.0, 0.0, 1.0])
+
+
+def _felt_along(felt: Felt, at_s: Array, speed_mps: Array, lengths: Sequence[_Windows], late_s: float) -> list[Array]:
+    """Return `_sums`, for windows of each length, of the sensor's own acceleration along the course, and that of a place a metre above it by pitch alone.
+
+    Both are times the square of half the length.
 
     Args:
-        at_s, speed_mps: (M,) of the motion. middle_s: (N,) of the windows. late_s: what is added to both times.
+        at_s, speed_mps: (M,) of the motion. late_s: what is added to both times.
     """
     course = np.exp(1j * np.interp(at_s + late_s, felt.t_s, felt.turned))
-    _, chord = bent(at_s, integral(at_s, speed_mps * course), middle_s, half_s)
-    ahead = np.exp(-1j * np.angle(chord))
+    place = integral(at_s, speed_mps * course)
     # Straight between measurements, as the motion is.
-    there = (np.interp(at_s + late_s, felt.t_s, way) for way in (felt.way_m, felt.swing_m))
-    moved, swung = (bent(at_s, way, middle_s, half_s)[0] for way in there)
-    return (moved * ahead).real, (swung * ahead).real
+    there = np.column_stack([np.interp(at_s + late_s, felt.t_s, way) for way in (felt.way_m, felt.swing_m)])
+    sums = []
+    for own in lengths:
+        ahead = np.exp(-1j * np.angle(own.first @ place))
+        moved, swung = ((own.second @ there) * ahead[:, None]).real.T
+        sums.append(_sums(own.along, moved, swung, own.begun))
+    return sums
 
 
 def _sums(along: Array, felt: Array, swung: Array, begun: NDArray[np.int64]) -> Array:

@@ -3,6 +3,7 @@
 
 import gc
 import os
+import sys
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,10 @@ import pytest
 # the matcher 5 %. Before numpy is imported; workers and programs that tests start inherit it.
 for threads in ("OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
+# Where the shell has Python keep nothing of what it compiles, each worker compiles all modules and tests anew, and each program that tests
+# start all modules: 5 s of the processor's time a worker, half a second a program.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 gc.set_threshold(100_000, 20, 100)  # looking again and again through runs that tests share took 3 % of the time
 
 

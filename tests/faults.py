@@ -12,6 +12,7 @@ import copyreg
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 from unittest.mock import patch
 
@@ -24,6 +25,7 @@ from graphloc.frames import Geodetic
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, Measurement, PoseFix
 from graphloc.online import OnlineSmoother
+from graphloc.recording import Recording
 
 STEP_NS = 1_000_000_000
 
@@ -41,14 +43,19 @@ Fault = Callable[[Arrivals, int, np.random.Generator], tuple[Arrivals, int]]
 
 
 def arrivals_of(run: SimulatedRun) -> Arrivals:
-    """Everything of a run, by stamp."""
-    imu = run.recording.imu
+    """Everything of a run, by stamp; a list of the caller's own."""
+    return list(_arrivals_of(run.recording))
+
+
+@lru_cache(maxsize=4)
+def _arrivals_of(recording: Recording) -> Arrivals:
+    imu = recording.imu
     assert imu is not None
     columns = zip(imu.stamps_ns.tolist(), imu.accel_mps2, imu.gyro_radps, imu.seqs.tolist(), strict=True)
     samples = [
         ImuSample(stamp_ns=s, sensor=imu.sensor, seq=q, accel_mps2=a, gyro_radps=g) for s, a, g, q in columns
     ]  # fmt: skip
-    every: list[Measurement] = sorted([*samples, *run.recording.measurements], key=lambda m: (m.stamp_ns, m.seq))
+    every: list[Measurement] = sorted([*samples, *recording.measurements], key=lambda m: (m.stamp_ns, m.seq))
     return [Arrival(m.stamp_ns, m) for m in every]
 
 

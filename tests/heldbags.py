@@ -36,11 +36,9 @@ class HeldBag(Bag):
         super().__init__(path)
         self.ros1 = False
         self._make, self._items = make, sorted(items, key=lambda item: item[1])
-        self._summary: dict[str, TopicSummary] = {}
-        counts = Counter(topic for topic, _, _ in self._items)
-        for topic, _, msg in self._items:
-            kind = _type_of(msg)
-            assert self._summary.setdefault(topic, TopicSummary(topic, (kind,), counts[topic])).msgtypes == (kind,)
+        counts = Counter((topic, _type_of(msg)) for topic, _, msg in self._items)
+        self._summary = {topic: TopicSummary(topic, (kind,), count) for (topic, kind), count in counts.items()}
+        assert len(self._summary) == len(counts), "messages of two types on one topic"
 
     def __enter__(self) -> Self:
         self.warnings = []
@@ -52,7 +50,8 @@ class HeldBag(Bag):
         """Return a topic, with the definition of its messages, as it is read from a file."""
         text, _ = self._make.store.generate_msgdef(of.msgtypes[0], ros_version=2)
         return Connection(
-            id=0, topic=of.topic, msgtype=of.msgtypes[0], msgcount=of.messages, digest="", owner=self,
+            id=0, topic=of.topic, msgtype=of.msgtypes[0], msgcount=of.messages, digest="",
+            owner=None,  # not this bag: it would be in a circle, and with all of its messages left to the garbage collector
             msgdef=MessageDefinition(MessageDefinitionFormat.MSG, text),
             ext=ConnectionExtRosbag2(serialization_format="cdr", offered_qos_profiles=[]),
         )  # fmt: skip

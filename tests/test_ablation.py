@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,16 +42,29 @@ def made(rate_hz: float = 2.5, **changes: object) -> SimulatedRun:
 
 
 @pytest.fixture(scope="module")
-def bad() -> tuple[SimulatedRun, Ablated]:
-    """A compass that is 12 deg off, and no truth to tell."""
-    run = made(compass_offset_deg=OFF_DEG, path="loops", duration_s=24.0)
-    return run, ablate(replace(run.recording, truth=None), run.config)
+def solved() -> tuple[SimulatedRun, Ablated, Solution]:
+    """A compass that is 12 deg off, and no truth to tell; what came of it, and of the run with all of its sensors."""
+    run, smooth, every = made(compass_offset_deg=OFF_DEG, path="loops", duration_s=24.0), app.smooth_recording, []
+
+    def kept(*arguments: Any, **options: Any) -> app.Run:
+        every.append(smooth(*arguments, **options))
+        return every[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(app, "smooth_recording", kept)
+        found = ablate(replace(run.recording, truth=None), run.config)
+    (whole,) = every  # the others are solved alone
+    return run, found, whole.solution
 
 
 @pytest.fixture(scope="module")
-def whole(bad: tuple[SimulatedRun, Ablated]) -> Solution:
-    run, _ = bad
-    return app.smooth_recording(replace(run.recording, truth=None), run.config).solution
+def bad(solved: tuple[SimulatedRun, Ablated, Solution]) -> tuple[SimulatedRun, Ablated]:
+    return solved[:2]
+
+
+@pytest.fixture(scope="module")
+def whole(solved: tuple[SimulatedRun, Ablated, Solution]) -> Solution:
+    return solved[2]
 
 
 def of(ablated: Ablated, name: str) -> Effect:

@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from graphloc.frontends._assess import MeasuredMotion
 from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
-from graphloc.frontends.time_offsets import MotionOffset, motion_time_offset
+from graphloc.frontends.time_offsets import MotionOffset, _bending, motion_time_offset
 from graphloc.signals.series import integral
 
 RATE_HZ = 100.0
@@ -90,3 +90,20 @@ def test_a_velocity_that_fails_in_a_tunnel_tells_no_delay_of_it(late_s: float, s
         assert mount is not None
         assert mount.coherence > 0.97
         assert mount.yaw_deg == pytest.approx(0.0, abs=2.0)
+
+
+def test_differences_of_places_are_those_between_measurements() -> None:
+    """Of uneven times, some of which come twice: by the matrices, and by the places interpolated at each of the three times."""
+    rng = np.random.default_rng(2)
+    at = np.sort(rng.uniform(0.0, 60.0, 150))
+    at[40] = at[41]
+    places = rng.normal(size=150) + 1j * rng.normal(size=150)
+    middle, half_s = np.arange(at[0] + 3.0, at[-1] - 3.0, 0.5), 1.7
+    middle[5], middle[6] = at[50], at[60] - half_s
+    behind, here, ahead = (
+        np.interp(t, at, places.real) + 1j * np.interp(t, at, places.imag)
+        for t in (middle - half_s, middle, middle + half_s)
+    )
+    second, first = _bending(at, middle, half_s)
+    np.testing.assert_allclose(second @ places, ahead - 2.0 * here + behind, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(first @ places, ahead - behind, rtol=1e-12, atol=1e-12)

@@ -1004,7 +1004,7 @@ def oriented(driven: list[Item], R_ahead_sensor: Array) -> list[Item]:
         yaw = Rotation.from_euler("z", float(np.interp(at, stamps, yaws))).as_matrix()
         q = m.orientation
         q.x, q.y, q.z, q.w = Rotation.from_matrix(yaw @ R_ahead_sensor).as_quat().tolist()
-        m.orientation_covariance[0] = 0.01
+        m.orientation_covariance = np.array([0.01, *m.orientation_covariance[1:]])
     return sorted(items, key=lambda item: item[1])
 
 

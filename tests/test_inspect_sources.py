@@ -127,7 +127,7 @@ def test_floats_beside_rtk_do_not_hide_the_yaw_of_an_imu(tmp_path: Path) -> None
     for k, m in enumerate(fixes):
         off = wander[k] if k > 0.7 * len(fixes) else (0.0, 0.0)
         m.latitude, m.longitude = m.latitude + off[0], m.longitude + off[1]
-        m.position_covariance[[0, 4, 8]] = 4.0 if k > 0.7 * len(fixes) else 4e-4
+        m.position_covariance = np.diag([4.0 if k > 0.7 * len(fixes) else 4e-4] * 3).ravel()
     found, _, _ = look(tmp_path, items, make)
     assert found.imus[0].mount.rpy_deg[2] == pytest.approx(180.0, abs=0.5)
 
@@ -1032,7 +1032,7 @@ def test_two_antennas_athwart_that_are_silent_in_turns_are_a_compass_beside_a_co
             heading = make.imu(at, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
             heading.orientation.x, heading.orientation.y = 0.0, 0.0
             heading.orientation.z, heading.orientation.w = np.sin(athwart / 2.0), np.cos(athwart / 2.0)
-            heading.orientation_covariance[:] = 0.0
+            heading.orientation_covariance = np.zeros(9)
             items.append(("/rover/navheading", at, heading))
         elif topic == "/imu":
             a, w = m.linear_acceleration, m.angular_velocity
