@@ -33,6 +33,7 @@ _PLACES = ("gnss", "pose", "aerial")
 _BESIDE_GNSS, _FEWEST_USED = ("pose", "aerial", "apriltag"), 10
 # Of a receiver from the track, beyond any multipath that lasts; and in sigmas of its slow error.
 _APART_M, _APART_SIGMAS = 20.0, 5.0
+_STAYS = 0.5  # what of an error changes, as a share of what stays, up to which the latter is said to be wrong; a choice
 _WORSE = 1.05  # times a filter's error, from which on ours is said to be larger
 
 
@@ -123,11 +124,29 @@ def _coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
         return
     trust, why = Trust.YES, ""
     if covered < _NOT_COVERED:
-        trust, why = Trust.NO, ". The bounds are far too small: a mount, the datum or a noise is wrong"
+        trust, why = (
+            Trust.NO,
+            _constant(data, solution) or ". The bounds are far too small: a mount, the datum or a noise is wrong",
+        )
     elif covered < _COVERED or (nees is not None and nees > _TOO_SURE):
-        trust, why = Trust.WITH_CARE, "; they are too small"
+        trust, why = Trust.WITH_CARE, _constant(data, solution) or "; they are too small"
     beside = "" if nees is None else f" (NEES {nees:.1f}; 2 where they are honest)"
     yield Reason(trust=trust, text=f"Its 95 % bounds held the truth for {percent(covered)} of the time{beside}{why}.")
+
+
+def _constant(data: ReportData, solution: Solution) -> str:
+    """Return a sentence on an error that is the same throughout; empty where most of it changes."""
+    if data.recording.truth is None:
+        return ""
+    off = errors(solution.trajectory, data.recording.truth).position_m[:, :2]
+    east, north = mean = off.mean(axis=0)
+    rest = rms(np.linalg.norm(off - mean, axis=1))
+    if rest >= _STAYS * np.linalg.norm(mean):
+        return ""
+    return (
+        f". All but {rest:.2f} m (RMS) of its error stays the same, {abs(east):.2f} m {'east' if east > 0.0 else 'west'} and {abs(north):.2f} m "
+        f"{'north' if north > 0.0 else 'south'} of the truth: the datum, where an image or a survey lies, or a mount is wrong"
+    )
 
 
 def _heading_coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
