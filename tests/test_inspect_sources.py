@@ -624,6 +624,20 @@ def test_a_compass_that_hangs_for_a_while_is_one(tmp_path: Path) -> None:
     assert "compass" in config.sensors
 
 
+@pytest.mark.parametrize("clock", [True, False], ids=["a clock behind", "a radio"])
+def test_fixes_that_take_seconds_are_told_from_a_clock_that_is_behind(clock: bool, tmp_path: Path) -> None:
+    """Both are recorded 2.5 s after their stamps; by radio, put right by that, a track was 5 m off at 10 m/s, and inside its bounds 60 % of the time."""
+    make, items = Messages(2), []
+    for topic, at, m in drive(make, status=0, sigma_m=0.5, seconds=120, noise_m=0.1):
+        if topic == "/fix" and clock:
+            m.header = make.header(at - 2 * S - S // 2, "gps")
+        if topic != "/wheel/odom":
+            items.append((topic, at + (5 * S // 2 if topic == "/fix" and not clock else 0), m))
+    found, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert config.sensors["gnss"].time_offset_s == pytest.approx(2.5 if clock else 0.0, abs=0.1)
+    assert ("its messages take as long" in render(found)) == (not clock)
+
+
 @pytest.mark.parametrize(("zero_deg", "drifts"), [(124.0, True), (90.0, False), (12.0, False)])
 def test_the_yaw_of_an_imu_without_a_north_drifts(zero_deg: float, *, drifts: bool, tmp_path: Path) -> None:
     """It counts from where it was switched on: taken for a compass, its drift of 8 deg in 200 s left a third of the headings outside their bounds."""
