@@ -95,14 +95,16 @@ def _by_courses(
 
     Courses tell headings of a vessel that goes ahead; of one that is set sideways only the gyroscope tells whether it is one. But
     an IMU's own orientation follows the gyroscope wherever north is. Two antennas know north, and an Imu of an orientation alone is
-    taken for such; athwart, they are a quarter turn off.
+    taken for such; athwart, they are a quarter turn off. Another heading that is a quarter turn off courses to either side is of a vessel that
+    swings, as at anchor, rather than of one mounted athwart that goes ahead and astern.
 
     Args:
         follows: whether it turns as the gyroscope does, though not with the courses.
     """
     quarter = report.two_antennas and fit.scatter_deg < _SIDEWAYS_DEG and abs(abs(fit.offset_deg) - 90.0) < _ASKEW_DEG
     knows_north = report.msgtype != IMU or abs(fit.offset_deg) < _RELATIVE_DEG or quarter
-    sideways = knows_north and follows
+    swings = bool(fit.astern) and abs(abs(fit.offset_deg) - 90.0) < _SIDEWAYS_DEG and not report.two_antennas
+    sideways = knows_north and (follows or (fit.good and swings and report.msgtype != IMU))
     report = replace(
         report,
         usable=fit.good or sideways,

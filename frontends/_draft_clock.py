@@ -36,6 +36,9 @@ _STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma: a receiver's stamps; rec
 # Fixes by NMEA are stamped as much after the times that they tell; those of whole seconds by anything up to a second.
 _LEAST_AFTER_S, _MOST_AFTER_S, _EVEN_S = 0.1, 1.0, 0.5
 _STAMPS = "stamps may be late: the delay is estimated with the run; set 0 where the receiver stamps with its own clock"
+_LONG_ON_ITS_WAY = "recorded {:.1f} s after its stamps, which fit what the IMU feels: its messages take as long, and its clock is right"
+# The longest that messages may take; share of that, within which another time is taken for the same.
+_LONGEST_WAY_S, _NEAR = 5.0, 0.25
 _ESTIMATED = ("gnss", "gnss_velocity")  # whose delay is, with the run
 _SET = ("imu", "gnss", "gnss_velocity", "body_velocity", "compass")  # whose clocks are set; poses may take their time
 
@@ -94,6 +97,9 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
     behind = _behind(topic, topics, inspection) if kind in _SET else None
     if behind is None:
         return []
+    if _takes_long(behind[0], topics, inspection):
+        said = f"guess: {_LONG_ON_ITS_WAY.format(behind[0])}"
+        return [f"  stamp_sigma_s: {_ON_ITS_WAY_S:.2f}  # {said}"] if kind in _ESTIMATED else []
     by_motion = _by_motion(kind, topic, inspection)
     told = [*_by_recording_times(kind, *behind), *by_motion] or _by_sentences(kind, topic, inspection)
     lines = []
@@ -105,6 +111,21 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
             f"  min_sigma_mps: {_FILTERED_SIGMA_MPS}  # guess: so late, it is filtered, and its errors are correlated"
         )
     return [*lines, _sigma_line(topics[topic], told, _hinted(topic, inspection))] if kind in _ESTIMATED else lines
+
+
+def _takes_long(behind_s: float, topics: Mapping[str, TopicReport], inspection: Inspection) -> bool:
+    """Return whether messages are recorded so long after their stamps because they take as long, as by radio: the clock is right.
+
+    Recording times cannot tell; what the IMU feels does, of fixes whose stamps are as far off: put right by that time they fit its motion as
+    much too late.
+    """
+    if not EPOCH_LIMIT_S < behind_s <= _LONGEST_WAY_S:
+        return False
+    for gnss in inspection.gnss:
+        own = _behind(bare_topic(gnss.topic), topics, inspection)
+        if own is not None and gnss.felt_s is not None and abs(own[0] - behind_s) < _NEAR * behind_s:
+            return abs(gnss.felt_s + behind_s) < _NEAR * behind_s
+    return False
 
 
 def _sigma_line(own: TopicReport, told: Sequence[_Told], hinted: tuple[float, float] | None) -> str:
@@ -191,6 +212,9 @@ def clock_lines(inspection: Inspection) -> list[str]:
             whose = f"{clock} is " if behind > 0.0 else ""
             gps = abs(abs(behind) - GPS_AHEAD_S) < LEAP_S
             why = f": {whose}GPS time, which is ahead of UTC by 18 s" if gps else ""
+            if _takes_long(behind, topics, inspection):
+                lines.append(f"{topic}: {_LONG_ON_ITS_WAY.format(behind)}")
+                continue
             off = f"{topic}: its clock is {abs(behind):.1f} s {way} {clock}, by the recording times"
             lines.append(f"{off}{why}; drafted as time_offset_s")
     return lines

@@ -119,6 +119,7 @@ def timed_fixes(
     """
     by_topic = {motion.source: motion for motion in motions}
     own_late = late.get(gnss.topic)
+    gnss = replace(gnss, felt_s=own_late.value_s if own_late is not None else None)
     candidates = {gnss.topic: own_late}
     for stream, report in velocities:
         said = late.get(stream.topic)

@@ -536,10 +536,9 @@ def test_sensors_that_share_a_topic_are_named(shared: bool, tmp_path: Path) -> N
     assert any("/fix: its messages name several frames (bow" in line for line in found.warnings) == shared
 
 
-@pytest.mark.parametrize("turned_deg", [0.0, 90.0, 180.0])
-def test_a_compass_tells_how_the_imu_of_a_ferry_with_two_bows_is_turned(turned_deg: float, tmp_path: Path) -> None:
-    """It goes astern for half of the time, where its course is no heading: the mount was taken as not turned, and the heading 88 deg off."""
-    make, rng = Messages(2), np.random.default_rng(7)
+def to_and_fro(make: Messages, turned_deg: float = 0.0, topic: str = "/compass", off_deg: float = 0.0) -> list[Item]:
+    """A craft that goes along one line of hers and back for 90 s, with an IMU turned in her, and a heading off that line."""
+    rng = np.random.default_rng(7)
     t = np.arange(0.0, 90.0, 0.02)
     speed, rate = 3.0 * np.sin(0.25 * t), 0.06 * np.sin(0.1 * t)
     yaw = 0.4 + np.cumsum(rate) * 0.02
@@ -554,11 +553,31 @@ def test_a_compass_tells_how_the_imu_of_a_ferry_with_two_bows_is_turned(turned_d
         at = START_NS + k * S // 50
         items.append(("/imu", at, make.imu(at, felt, (0.0, 0.0, rate[k] + 1e-3 * rng.normal()))))
         if k % 10 == 0:
-            half = yaw[k] / 2.0
+            half = (yaw[k] + np.radians(off_deg)) / 2.0
             items.append(("/fix", at, make.fix(at, lla[k][0], lla[k][1], lla[k][2], 0, 0.25 * np.eye(3).ravel())))
-            items.append(("/compass", at, make.compass(at, (0.0, 0.0, np.sin(half), np.cos(half)))))
-    _, config, _ = look(tmp_path, items, make)
+            items.append((topic, at, make.compass(at, (0.0, 0.0, np.sin(half), np.cos(half)))))
+    return items
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 90.0, 180.0])
+def test_a_compass_tells_how_the_imu_of_a_ferry_with_two_bows_is_turned(turned_deg: float, tmp_path: Path) -> None:
+    """It goes astern for half of the time, where its course is no heading: the mount was taken as not turned, and the heading 88 deg off."""
+    make = Messages(2)
+    _, config, _ = look(tmp_path, to_and_fro(make, turned_deg), make)
     assert config.sensors["imu"].mount.rpy_deg == pytest.approx((0.0, 0.0, turned_deg))
+
+
+@pytest.mark.parametrize(("topic", "mount_deg"), [("/compass", 0.0), ("/gps/heading", 90.0)])
+def test_a_craft_that_swings_to_either_side_has_no_compass_athwart(
+    topic: str, mount_deg: float, tmp_path: Path
+) -> None:
+    """At anchor a compass was taken for mounted athwart, and the heading 90 deg off, out of its bounds; two antennas may be."""
+    make = Messages(2)
+    _, config, _ = look(tmp_path, to_and_fro(make, topic=topic, off_deg=90.0), make)
+    compass = config.sensors["compass"]
+    assert isinstance(compass, CompassConfig)
+    assert compass.mount.rpy_deg[2] == mount_deg
+    assert mount_deg or compass.mount_offset_sigma_deg >= 10.0
 
 
 def test_the_imu_of_a_stabilised_camera_is_not_the_vessels(tmp_path: Path) -> None:
@@ -603,6 +622,20 @@ def test_a_compass_that_hangs_for_a_while_is_one(tmp_path: Path) -> None:
             m.quaternion = held
     _, config, _ = look(tmp_path, items, make)
     assert "compass" in config.sensors
+
+
+@pytest.mark.parametrize("clock", [True, False], ids=["a clock behind", "a radio"])
+def test_fixes_that_take_seconds_are_told_from_a_clock_that_is_behind(clock: bool, tmp_path: Path) -> None:
+    """Both are recorded 2.5 s after their stamps; by radio, put right by that, a track was 5 m off at 10 m/s, and inside its bounds 60 % of the time."""
+    make, items = Messages(2), []
+    for topic, at, m in drive(make, status=0, sigma_m=0.5, seconds=120, noise_m=0.1):
+        if topic == "/fix" and clock:
+            m.header = make.header(at - 2 * S - S // 2, "gps")
+        if topic != "/wheel/odom":
+            items.append((topic, at + (5 * S // 2 if topic == "/fix" and not clock else 0), m))
+    found, config, _ = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert config.sensors["gnss"].time_offset_s == pytest.approx(2.5 if clock else 0.0, abs=0.1)
+    assert ("its messages take as long" in render(found)) == (not clock)
 
 
 @pytest.mark.parametrize(("zero_deg", "drifts"), [(124.0, True), (90.0, False), (12.0, False)])
