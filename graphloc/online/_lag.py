@@ -291,11 +291,13 @@ class Lag:
         return "; ".join([*map(why_in_doubt, doubtful), *map(why_late, late), *map(why_unlikely, unlikely)])
 
     def _settled_ns(self, name: str) -> int:
-        """Return when last a sensor of smaller slow error agreed that reads the same receiver by turns (RTK); 0: there is none."""
+        """Return when last another sensor of position agreed: of those that read the same receiver by turns, one of smaller slow error (RTK); 0: none has."""
         own, streams = self.problem.streams[name], self.problem.streams
-        beside = [streams[other] for other in self.problem.config.by_turns(name)[1:] if other in streams]
+        same = self.problem.config.by_turns(name)[1:]
+        beside = [streams[other] for other in same if other in streams]
         better = [s.name for s in beside if s.slow and own.slow and s.slow.sigma[0] < own.slow.sigma[0]]
-        return max((self._agreement.agreed_ns.get(other, 0) for other in better), default=0)
+        others = [s.name for s in streams.values() if s.row.absolute and s.name not in (name, *same)]
+        return max((self._agreement.agreed_ns.get(other, 0) for other in (*better, *others)), default=0)
 
     @property
     def denied(self) -> Mapping[str, int]:

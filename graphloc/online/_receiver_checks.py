@@ -66,6 +66,9 @@ class ReceiverChecks:
         sigma_m = largest_sigma(residual.white_cov)
         if self._is_frozen(stream, m, told_m, estimated_m, sigma_m):
             return _FROZEN
+        if not self._is_alone(stream):
+            stream.receiver.jump.let_go()
+            return ""
         self._check_jump(stream, m.stamp_ns, told_m, sigma_m, self._off(stream, at, residual, told_m - estimated_m))
         return _OFF if stream.receiver.jump.suspects(m.stamp_ns) else ""
 
@@ -92,6 +95,13 @@ class ReceiverChecks:
             self._agreement.note(stream, m, None)
         return detector.frozen
 
+    def _is_alone(self, stream: LiveStream) -> bool:
+        """Return whether no other sensor holds the place: one that is silent, as cameras are until the berth is in sight, does not either."""
+        same = self._problem.config.by_turns(stream.name)[1:]
+        others = [s for s in self._problem.streams.values() if s.row.absolute and s.name not in (stream.name, *same)]
+        heard = [s for s in others if len(s.measurements) > s.measurements.first]
+        return only_position_sensor(stream, [stream, *heard])
+
     def _off(self, stream: LiveStream, at: Attachment, residual: Residual, off_m: Array) -> OffPrediction | None:
         """Return how the newest fix lies to its prediction; None where the receiver's slow error is switched off, or cannot jump.
 
@@ -100,7 +110,8 @@ class ReceiverChecks:
         Args:
             off_m: (2,) of the fix from the estimated place, slow error aside.
         """
-        if stream.left_out is None or not stream.left_out.jumps or stream.receiver.jump.jumps != stream.jumps:
+        slow = stream.left_out or stream.slow
+        if slow is None or not slow.jumps or stream.receiver.jump.jumps != stream.jumps:
             return None
         without = residual.raw
         if stream.slow is not None and at.slow_value is not None and residual.slow_jacobian is not None:
@@ -118,13 +129,10 @@ class ReceiverChecks:
     def _check_jump(
         self, stream: LiveStream, stamp_ns: int, told_m: Array, sigma_m: float, off: OffPrediction | None
     ) -> None:
-        same = self._problem.config.by_turns(stream.name)[1:]
-        absolute = [s for s in self._problem.streams.values() if s.row.absolute and s.name not in same]
-        if only_position_sensor(stream, absolute):
-            slow = stream.left_out or stream.slow
-            allowed = slow is not None
-            found = stream.receiver.jump.note(stamp_ns, told_m, sigma_m, allowed_m=allowed_jump_m(slow), off=off)
-            self._warnings += jump_warnings(stream.name, *found, allowed=allowed, followed=not allowed)
+        slow = stream.left_out or stream.slow
+        allowed = slow is not None
+        found = stream.receiver.jump.note(stamp_ns, told_m, sigma_m, allowed_m=allowed_jump_m(slow), off=off)
+        self._warnings += jump_warnings(stream.name, *found, allowed=allowed, followed=not allowed)
 
     def _reject_since(self, stream: LiveStream, since_ns: int, until_ns: int) -> None:
         """Take the fixes of an interval out of the graph: they pulled the estimate along."""

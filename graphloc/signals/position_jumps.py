@@ -242,6 +242,10 @@ class JumpDetector:
         """Forget the jumps, and what may be one: it was off an estimate that is given up."""
         self.jumps, self._off, self._before = (), [], None
 
+    def let_go(self) -> None:
+        """Forget what may be a jump: another sensor measures position now, and shows which it is."""
+        self._off, self._before = [], None
+
     def forget_since(self, stamp_ns: int) -> None:
         """Forget the fixes since a stamp, and the jumps found in them: they are none of a receiver that goes along."""
         self._seen = deque((kept for kept in self._seen if kept[0] < stamp_ns), maxlen=_KEPT)
