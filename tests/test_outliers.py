@@ -19,7 +19,7 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.graph import Residual
-from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, Measurement
+from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, Measurement, PoseFix
 from graphloc.online import OnlineSmoother
 from graphloc.online import _start as online_start
 from graphloc.recording import Recording
@@ -727,6 +727,33 @@ def test_a_jump_of_the_only_receiver_is_not_followed_online(gnss_hz: float) -> N
     assert sum("the window was rebuilt" in w for w in live.stats.warnings) == 2
     far_off = live.trajectory.stamps_ns > run.truth.stamps_ns[0] + 25_000_000_000
     assert Health.GOOD not in [h for h, k in zip(live.health, far_off, strict=True) if k]
+
+
+def test_a_jump_is_not_followed_while_the_other_sensors_of_position_are_silent() -> None:
+    """12 m for 8 s and back, then matches, as of a vessel that comes in. As if these had held its place, it was followed by 3.3 m, at 11 m/s by 12."""
+    scenario = Scenario(
+        path="loops", duration_s=30.0, noise="clean", false_fraction=0.0, compass_hz=1.0, imu_hz=50.0, gnss_hz=2.0
+    )
+    run = simulate(scenario, 1)
+    begin_ns = int(run.truth.stamps_ns[0])
+
+    def struck(m: Measurement) -> Measurement:
+        if not isinstance(m, GnssPosition) or not 12.0 <= (m.stamp_ns - begin_ns) * 1e-9 < 20.0:
+            return m
+        return replace(m, position=Geodetic(m.position[0] + 12.0 / 111_300.0, *m.position[1:]))
+
+    struck_run = run.recording.changed(struck)
+    kept = [m for m in struck_run.measurements if not isinstance(m, PoseFix) or (m.stamp_ns - begin_ns) * 1e-9 > 24.0]
+    live = replay(replace(struck_run, measurements=tuple(kept)), with_few_states(run.config)).solution
+    off = compare_to_truth(live.trajectory, run.truth)
+    assert off.position_max_m < 2.0
+    assert off.coverage_95 is not None
+    assert off.coverage_95 > 0.95
+    assert sum("position jump" in w and "the window was rebuilt" in w for w in live.stats.warnings) == 2
+    at_s = (live.trajectory.stamps_ns - begin_ns) * 1e-9
+    health = np.array(live.health)
+    assert Health.GOOD not in health[(at_s > 15.0) & (at_s < 23.0)]
+    assert (health[at_s > 28.0] == Health.GOOD).all()  # the matches agree
 
 
 def test_a_jump_of_the_only_receiver_is_no_noise_of_the_imu_at_the_start() -> None:
