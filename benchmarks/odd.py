@@ -285,7 +285,7 @@ CASES: dict[str, Odd] = {
     ),
     "SBG's own messages, ENU, ROS 1": Odd(
         craft="ferry", kind="ros1", imu_rpy_deg=(0.0, 0.0, -90.0), change=_makers.sbg(enu=True),
-        draft=("gps_hdt\n    convention: enu", r"gps_vel[^\n]*\n    mount", r"0.0, 0.0, -90.0\]\}  # guess: gravity"), **_RTK,
+        draft=("gps_hdt\n    convention: enu", r"gps_vel[^\n]*\n    antenna: gnss", r"0.0, 0.0, -90.0\]\}  # guess: gravity"), **_RTK,
     ),
     "PX4's own messages": Odd(
         craft="boat", kind="sqlite3", imu_rpy_deg=(180.0, 0.0, 0.0), change=_makers.px4, draft=("kind: gnss_velocity",)
