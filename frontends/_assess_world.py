@@ -75,6 +75,13 @@ def world_of(poses: TopicData, fixes: ReferenceTrack, antenna_m: Array | None) -
     if len(p) < 10 or extent < _EXTENT_M:
         return World(None, f"the GNSS track is too short ({extent:.0f} m) to check its frame against")
     moved = float(np.hypot(*np.ptp(q[:, :2], axis=0)))
+    rises = float(np.ptp(poses.rows[keep, 2]))
+    if rises > 0.0 and not np.ptp(poses.rows[keep, :2], axis=0).any():
+        return World(
+            None,
+            f"its x and y stay the same while z ranges over {rises:.1f} m, so it measures height or depth alone: read it as kind pose with axes: [z], if its z is up and counts from the datum's height_m",
+            pose=False,
+        )
     if moved < _STANDS * extent:
         return World(
             None,

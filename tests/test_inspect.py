@@ -725,15 +725,18 @@ def test_places_in_a_map_grid_alone_are_fixes_once_the_grid_is_named(yaw_deg: fl
 
 
 def test_another_body_is_no_truth(tmp_path: Path) -> None:
-    """Odometry of something that all but stays where it is, while the craft drives."""
+    """Odometry of something that all but stays where it is, while the craft drives; and of a pressure sensor, which tells depth alone."""
     make, items = Messages(2), drive(Messages(2))
     for k, (_, log_ns, fix) in enumerate([item for item in items if item[0] == "/fix"]):
         stamp = fix.header.stamp.sec * S + fix.header.stamp.nanosec
         items.append(("/truth/dock", log_ns, make.odometry(stamp, (140.0 + 0.3 * np.sin(0.1 * k), 86.0, 0.0))))
+        items.append(("/depth", log_ns, make.odometry(stamp, (0.0, 0.0, -2.0 - np.sin(0.1 * k)))))
     found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
     assert config.truth_topic is None
     assert config.datum is None
     assert "# /truth/dock: left out, it moves by" in text
+    assert "# /depth: left out, its x and y stay the same while z ranges over 2.0 m" in text
+    assert "read it as kind pose with axes: [z]" in text
     assert "/truth/dock: left out" in render(found)
     assert "truth_topic" not in render(found)
 
