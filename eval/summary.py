@@ -78,7 +78,10 @@ def read_runs(folders: Sequence[Path]) -> tuple[FinishedRun, ...]:
         raise InputError(f"{twice}: given twice, so it would count twice")
     other = next((folder for folder in folders if not is_run(folder)), None)
     if other is not None:
-        raise InputError(f"{other}: is not the folder of a finished run: it has no {MARK}")
+        within = any(other.glob(f"*/{MARK}"))
+        raise InputError(
+            f"{other}: is not the folder of a finished run: it has no {MARK}{f'; those in it have: {other}/*' * within}"
+        )
     short = [folder.name for folder in whole]
     names = [name if short.count(name) == 1 else str(folder) for name, folder in zip(short, folders, strict=True)]
     return tuple(_read(folder, name) for folder, name in zip(folders, names, strict=True))

@@ -72,7 +72,9 @@ def _epoch_warning(own: _SensorClock, reference: _SensorClock) -> list[str]:
     instead = f" instead of {now_s:g}" if now_s else ""
     said = f"its clock is {abs(behind_s):.3f} s {way} that of {reference.sensor}, by the recording times"
     cure = f"set its time_offset_s to {now_s + behind_s:.3f}{instead} (that includes the difference of their transport delays)"
-    return [f"{own.sensor}: {said}; if that is right, {cure}"]
+    return [
+        f"{own.sensor}: {said}; {cure}, unless its messages take so long on their way (by radio): see what `inspect` drafts"
+    ]
 
 
 def _gain_warning(own: _SensorClock, reference: _SensorClock, gain_s: float) -> str:

@@ -238,7 +238,7 @@ def _error_lines(compass: CompassReport) -> list[str]:
 def _mount_lines(compass: CompassReport) -> list[str]:
     """By how much the course says that a compass is turned in the craft, and how well a course tells it."""
     if compass.offset_deg is None:
-        said = "no GNSS course to compare with: declination or a mount angle may be included; 1 for a true heading whose mount is known"
+        said = "no GNSS course tells it: declination or a mount angle may be included; 1 for a true heading whose mount is known"
         return [f"  mount_offset_sigma_deg: {_UNKNOWN_DEG:.1f}  # guess: {said}"]
     lines = []
     sigma, why = abs(compass.offset_deg), "as far as it is off the GNSS course"

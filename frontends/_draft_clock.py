@@ -38,7 +38,7 @@ _LEAST_AFTER_S, _MOST_AFTER_S, _EVEN_S = 0.1, 1.0, 0.5
 _STAMPS = "stamps may be late: the delay is estimated with the run; set 0 where the receiver stamps with its own clock"
 _LONG_ON_ITS_WAY = "recorded {:.1f} s after its stamps, which fit what the IMU feels: its messages take as long, and its clock is right"
 # The longest that messages may take; share of that, within which another time is taken for the same.
-_LONGEST_WAY_S, _NEAR = 5.0, 0.25
+_LONGEST_WAY_S, _NEAR = 3.0, 0.25
 _ESTIMATED = ("gnss", "gnss_velocity")  # whose delay is, with the run
 _SET = ("imu", "gnss", "gnss_velocity", "body_velocity", "compass")  # whose clocks are set; poses may take their time
 

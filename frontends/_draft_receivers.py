@@ -64,7 +64,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         if gnss.reported_sigma_m and max(gnss.reported_sigma_m[:2]) < RTK_SIGMA_M:
             fixed = f"; {{{_RTK_SLOW_ERROR}}} if RTK makes them as good as they claim, which their status does not say"
         lines.append(f"  slow_error: {{{more}}}  # guess: {gnss.why}{said}{fixed}")
-        lines += _never_good(slow_m)
+        lines += _never_good(slow_m) if enabled else []
     return lines
 
 

@@ -26,10 +26,6 @@ _SAME_M = 0.05  # by which two topics of one receiver wander against each other 
 _SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
 # Of the run, from which a receiver is there throughout; of the fixes, from which it says as much as another.
 _COVERS = 0.8
-_ROAMS_M, _STAYS = (
-    50.0,
-    0.05,
-)  # from which a receiver goes about; as a share of that, within which another one stays where it is
 
 
 def receivers_of(bag: Contents, elsewhere: Mapping[str, str] = _NONE) -> list[GnssReport]:
@@ -119,7 +115,7 @@ def timed_fixes(
     """
     by_topic = {motion.source: motion for motion in motions}
     own_late = late.get(gnss.topic)
-    gnss = replace(gnss, felt_s=own_late.value_s if own_late is not None else None)
+    gnss = replace(gnss, felt_s=own_late.value_s if own_late is not None and own_late.clear else None)
     candidates = {gnss.topic: own_late}
     for stream, report in velocities:
         said = late.get(stream.topic)

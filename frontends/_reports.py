@@ -182,7 +182,7 @@ class GnssReport:
         white_m: the horizontal scatter, where no motion is in it: fixes come fast, or scatter by more than a craft would.
         spans_s: time from its first fix to its last. late_s: what should be added to its stamps by the accelerometer, and
             1 sigma; None where that does not tell. late_by: whose motion told so: its own, or that of a velocity of the same device.
-        hinted_s: likewise, where that is likelier than none and not clear. felt_s: the same, however unclear; None where nothing tells.
+        hinted_s: likewise, where that is likelier than none and not clear. felt_s: the same by the fixes alone, where that is clear; else None.
         frozen, stored: warning where it repeats one position while the vessel moves, or one of before the run; '' where it does not.
         in_radians: warning where its positions look like rad; '' where they do not.
         wander: by how much their error changes along the way, by `wander_by`, wheels or a velocity; empty where these do not tell.

@@ -14,11 +14,12 @@ from graphloc.frontends._contents import Contents
 from graphloc.frontends._reader import either
 from graphloc.frontends._reports import GnssReport, ImuReport, OdometryReport, bare_topic
 from graphloc.frontends._streams import TopicData
-from graphloc.frontends.decode import FIX_TYPES, IMU, NMEA, NUMBERS
+from graphloc.frontends.decode import FIX_TYPES, IMU, NMEA, NUMBERS, QUATERNION, TWIST
 from graphloc.frontends.source import TopicSummary
 
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
 _MOST_NAMED = 6
+_OF_A_SENSOR = (IMU, *FIX_TYPES, TWIST, QUATERNION)
 _SHARE = 0.05  # of the messages of a topic, above which what they name is no mistake
 _MAGNETIC = "sensor_msgs/msg/MagneticField"
 # Packets and clouds in a maker's own types, and scans of a plane; lists of tags other than `LISTS`.
@@ -95,10 +96,13 @@ def shared_topics(streams: Sequence[TopicData]) -> list[str]:
     """Return a line for each topic on which several sensors are, by the frames that its messages name."""
     lines = {}
     for stream in streams:
+        # Of poses it is the frame that they are in.
+        if stream.msgtype not in _OF_A_SENSOR:
+            continue
         topic = bare_topic(stream.topic)
-        said = {frame: n for frame, n in stream.frames.most_common() if n > _SHARE * stream.frames.total()}
+        said = {frame: n for frame, n in stream.frames.most_common() if frame and n > _SHARE * stream.frames.total()}
         if len(said) > 1:
-            names = ", ".join(f"{frame or 'none'} {n}" for frame, n in said.items())
+            names = ", ".join(f"{frame} {n}" for frame, n in said.items())
             lines[topic] = (
                 f"{topic}: its messages name several frames ({names}): they are of several sensors, and taken for those of one; let each driver "
                 "write to a topic of its own"

@@ -151,7 +151,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
 
 def _elsewhere(bag: Contents, gnss: Sequence[GnssReport]) -> dict[str, str]:
     """Return why receivers are not of this craft, by topic: the best IMU feels nothing of how they move, but of how another one does, far from them."""
-    farthest_m = max((report.roams_m for report in gnss), default=0.0)
+    farthest_m = max((report.roams_m for report in gnss if not filtered(report.topic)), default=0.0)
 
     def stays(report: GnssReport) -> bool:
         return report.roams_m < _STAYS * farthest_m and farthest_m >= TWO_CRAFT_M
@@ -168,8 +168,9 @@ def _elsewhere(bag: Contents, gnss: Sequence[GnssReport]) -> dict[str, str]:
         return bool(imus) and feels_motion(bag.aligned[imus[0].topic], imus[0], evidence)
 
     unfelt = {report.topic for report in gnss if not felt(report)}
-    aboard = next((report for report in gnss if report.topic not in unfelt), None)
-    if aboard is None or aboard is gnss[0]:
+    # A filter's output moves as the IMU does, of which it is made.
+    aboard = next((report for report in gnss if report.topic not in unfelt and not filtered(report.topic)), None)
+    if aboard is None:
         return {}
     why = f"{imus[0].topic} feels how {aboard.topic} moves, and nothing of how this one does: of another craft"
     base = f"while {aboard.topic} goes {aboard.roams_m:.0f} m, as {imus[0].topic} feels: a base station ashore, or a receiver that hangs"

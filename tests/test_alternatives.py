@@ -129,7 +129,7 @@ def test_a_match_that_outweighs_all_else_is_taken_out_by_solving_again(monkeypat
     def note(judge: Any, *args: Any) -> Any:
         timeline, found = judge._problem.timeline, solved(judge, *args)  # noqa: SLF001
         here = judge._window.values.atPose3(keys.pose(timeline.last)).translation()  # noqa: SLF001
-        (without,) = (c for c in found[0] if not any(mode is not None for mode in c.modes))
+        (without,) = (c for c in found if not any(mode is not None for mode in c.modes))
         noted.append((timeline.stamps_ns[timeline.last], here, without.step[:3]))
         return found
 

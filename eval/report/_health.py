@@ -117,7 +117,7 @@ def section(solutions: Sequence[Solution], begin_ns: int) -> str:
             )  # fmt: skip
         if rows:
             left = f"{len(whole) - _MOST} more reasons are in solution.csv." if len(whole) > _MOST else ""
-            head = ("", "times", "in all", "longest, s", "why", "what ends it")
+            head = ("", "times", "in all", "longest, s (from, to)", "why", "what ends it")
             parts.append(f"<h3>{solution.name}: {said_of(solution)}</h3>{table(head, rows, text=(4, 5))}{note(left)}")
     return "".join(parts)
 

@@ -145,7 +145,7 @@ def _constant(data: ReportData, solution: Solution) -> str:
         return ""
     return (
         f". All but {rest:.2f} m (RMS) of its error stays the same, {abs(east):.2f} m {'east' if east > 0.0 else 'west'} and {abs(north):.2f} m "
-        f"{'north' if north > 0.0 else 'south'} of the truth: the datum, where an image or a survey lies, or a mount is wrong"
+        f"{'north' if north > 0.0 else 'south'} of the truth: the datum, where an image or a survey lies, or a mount is wrong, or a receiver drifts for longer than the run"
     )
 
 

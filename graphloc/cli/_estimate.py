@@ -32,10 +32,8 @@ def inspect(
 ) -> None:
     """Show what a bag holds and write a first vessel.yaml, with every guess marked."""
     from graphloc.errors import InputError, OutputError
-    from graphloc.folders import check_writable
     from graphloc.frontends import inspect as inspection
 
-    check_writable(config)
     found = inspection.inspect_bag(bag)
     typer.echo(json.dumps(found.as_dict(), indent=2) if as_json else inspection.render(found))
     if not found.usable:

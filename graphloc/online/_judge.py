@@ -261,21 +261,22 @@ class Judge:
         return moved
 
     def _weigh_choices(self, stream: LiveStream) -> bool:
-        """Try the most probable choice of the newest measurements, and keep the spread of the others; return whether any was tried.
+        """Try the most probable choice of the newest measurements, and keep the spread of the others; return whether the estimate may have moved.
 
         Only choices that believe something more are tried: that all are false is also the explanation for a frozen sensor.
         """
+        settled = False
         for tried in range(_ROUNDS):
             self._others.pop(stream.name, None)
             own = self._group(stream)
             if not own or stream.constants:
-                return tried > 0
+                return settled or tried > 0
             attached, found = self._attach(own)
             held = [e.within for e in own]
             cov = self._states.joint(attached, [modes[0] for modes in found])
             weighed, unplaced = choices(stream, [e.index for e in own], found, cov, held)
-            if unplaced:
-                weighed, unplaced = self._solved_without(stream, own) or (weighed, unplaced)
+            if unplaced and (solved := self._solved_without(stream, own)):
+                weighed, settled = solved, True
             best = weighed[0].modes
             now = tuple(h[0] if h is not None and h[1] >= AGREES else None for h in held)
             chosen = frozenset((e.index, mode) for e, mode in zip(own, best, strict=True))
@@ -287,11 +288,11 @@ class Judge:
             mean, around = _spread(weighed, cov, moves=best == now, unplaced=unplaced)
             if np.trace(around) > _SHOWS * np.trace(cov[:3, :3]):
                 self._others[stream.name] = mean, around
-            return tried > 0
+            return settled or tried > 0
         return True
 
-    def _solved_without(self, stream: LiveStream, own: list[Entry]) -> tuple[list[Choice], bool] | None:
-        """Return the choices (see `choices`) from the window solved without these measurements; None where it cannot be.
+    def _solved_without(self, stream: LiveStream, own: list[Entry]) -> list[Choice]:
+        """Return the choices (see `choices`) from the window solved without these measurements; none where it cannot be.
 
         They are much more precise than all else together: linear algebra does not tell where that leaves the estimate.
         """
@@ -304,12 +305,12 @@ class Judge:
             self._window.settle(_STEPS)
             attached, found = self._attach(own)
             cov = self._states.joint(attached, [modes[0] for modes in found])
-            weighed, unplaced = choices(stream, [e.index for e in own], found, cov, [e.within for e in own])
+            weighed, _ = choices(stream, [e.index for e in own], found, cov, [e.within for e in own])
             step = np.zeros(len(cov))
             step[:3] = self._window.values.atPose3(newest).translation() - here
-            return [replace(c, step=c.step + step) for c in weighed], unplaced
+            return [replace(c, step=c.step + step) for c in weighed]
         except (SolveError, RuntimeError, ArithmeticError, ValueError, np.linalg.LinAlgError):
-            return None
+            return []
         finally:
             back()
 

@@ -243,8 +243,10 @@ class JumpDetector:
         self.jumps, self._off, self._before = (), [], None
 
     def let_go(self) -> None:
-        """Forget what may be a jump: another sensor measures position now, and shows which it is."""
+        """Forget what may be a jump: another sensor measures position now, and shows which it is; nor is one looked for among those fixes later."""
         self._off, self._before = [], None
+        if self._seen:
+            self._judged_ns = max(self._judged_ns, self._seen[-1][0])
 
     def forget_since(self, stamp_ns: int) -> None:
         """Forget the fixes since a stamp, and the jumps found in them: they are none of a receiver that goes along."""
