@@ -222,6 +222,7 @@ class TopicData:
     def joined(cls, topic: str, parts: Sequence[TopicData]) -> TopicData:
         """Return the messages of several streams of one type as one, in the order of their recording."""
         whole = cls(topic, parts[0].msgtype, parts[0].frame_id, sum(p.undecodable for p in parts))
+        whole.frames = sum((p.frames for p in parts), Counter())
         messages = [
             message
             for p in parts

@@ -199,11 +199,11 @@ def test_a_turn_on_the_spot_is_no_gyro_bias(compass_s: float | None) -> None:
 
 def test_a_rest_without_a_heading_sensor_is_soon_settled() -> None:
     """Nothing holds the heading, so each step turns it by degrees, and the track with it: 21 passes over half an hour at a berth."""
-    sensors = Scenario(path="still", duration_s=200.0, imu_hz=20.0, gnss_hz=1.0, compass_hz=0.0, pose_hz=0.0)
+    sensors = Scenario(path="still", duration_s=160.0, imu_hz=20.0, gnss_hz=1.0, compass_hz=0.0, pose_hz=0.0)
     run = simulate(replace(sensors, wave_roll_deg=0.0, wave_pitch_deg=0.0, wave_heave_m=0.0), 1)
     stats = app.smooth_recording(run.recording, with_few_states(run.config, 1.0)).solution.stats
     assert stats.converged
-    assert stats.passes <= 6  # was 19
+    assert stats.passes <= 4  # was 21
     assert any("the heading is a guess" in w for w in stats.warnings)
 
 

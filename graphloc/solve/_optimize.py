@@ -55,7 +55,7 @@ def optimize(
             enough = relative_tol * error + _ABSOLUTE_TOL
             if abs(last - error) <= enough:
                 break
-            promised = linear.error(values.zeroVectors()) - linear.error(values.localCoordinates(following))
+            promised = _promised(linear, values, following)
             if abs(last - error - promised) <= _AS_PROMISED * enough:
                 break
             values, last = following, error
@@ -72,6 +72,11 @@ def _stepper(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> gtsam.Ga
     params = gtsam.GaussNewtonParams()
     params.setLinearSolverType("MULTIFRONTAL_QR")
     return gtsam.GaussNewtonOptimizer(graph, guess, params)
+
+
+def _promised(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, following: gtsam.Values) -> float:
+    """Return by how much a step lowers the cost of the linear model, nats: half the square of its length in sigmas."""
+    return float(linear.error(values.zeroVectors()) - linear.error(values.localCoordinates(following)))
 
 
 def _of(stepper: gtsam.GaussNewtonOptimizer) -> gtsam.Values:
@@ -95,15 +100,16 @@ def _levenberg_marquardt(
     return Optimized(values, used + optimizer.iterations(), optimizer.error())
 
 
-def full_step(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> gtsam.Values:
-    """Return the result of one full step from near the solution.
+def full_step(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> tuple[gtsam.Values, float]:
+    """Return the result of one full step from near the solution, and by how much the linear model says that it lowers the cost, nats.
 
     Raises:
         SolveError: a state is not determined.
     """
     try:
         stepper = _stepper(graph, guess)
-        stepper.iterate()
-        return _of(stepper)
+        linear = stepper.iterate()
+        values = _of(stepper)
+        return values, _promised(linear, guess, values)
     except RuntimeError as error:
         raise not_solved("the solver failed", error) from error

@@ -25,9 +25,9 @@ _OUTLIER = 0.1  # weight under its own kernel below which a measurement is an ou
 
 @dataclass(frozen=True, slots=True)
 class Optimised:
-    """One optimisation of the whole run: values, the graph they come from, how far any pose moved, and by how much the cost changed (nats).
+    """One optimisation of the whole run: values, the graph they come from, and how far any pose moved.
 
-    `made`: where the factors of each measurement stand in the graph.
+    `made`: where the factors of each measurement stand in the graph. `changed_nats`: by how much a single step changed the cost, or should have.
     """
 
     values: gtsam.Values
@@ -35,7 +35,7 @@ class Optimised:
     made: Made
     iterations: int
     moved_m: float
-    changed_nats: float
+    changed_nats: float = float("inf")
 
     def settled(self) -> bool:
         """Return whether it moved the track by little, or by little of what is known of it."""
@@ -49,25 +49,19 @@ def optimise_run(
     last, made = len(problem.timeline) - 1, Made()
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps, made=made)
     solved = optimize(graph, guess, 12, 1e-3)
-    return _optimised(graph, made, guess, solved.values, solved.iterations)
-
-
-def _optimised(
-    graph: gtsam.NonlinearFactorGraph, made: Made, guess: gtsam.Values, values: gtsam.Values, iterations: int
-) -> Optimised:
-    changed_nats = abs(float(graph.error(values)) - float(graph.error(guess)))
-    return Optimised(values, graph, made, iterations, moved(guess, values), changed_nats)
+    return Optimised(solved.values, graph, made, solved.iterations, moved(guess, solved.values))
 
 
 def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Optimised:
     """Take one step over the whole run, and iterate only where the cost rises by more than a nonlinear step near the minimum does."""
     last, made = len(problem.timeline) - 1, Made()
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, made=made)
-    values, iterations = full_step(graph, guess), 1
-    before = float(graph.error(guess))
-    if not float(graph.error(values)) < _UPHILL * before + 1.0:
-        values, iterations, _ = optimize(graph, guess, 12, 1e-3)
-    return _optimised(graph, made, guess, values, iterations)
+    values, promised = full_step(graph, guess)
+    before, after = float(graph.error(guess)), float(graph.error(values))
+    if not after < _UPHILL * before + 1.0:
+        solved = optimize(graph, guess, 12, 1e-3)
+        return Optimised(solved.values, graph, made, solved.iterations, moved(guess, solved.values))
+    return Optimised(values, graph, made, 1, moved(guess, values), max(promised, abs(before - after)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
