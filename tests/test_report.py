@@ -92,6 +92,18 @@ def test_trust_follows_coverage_warnings_and_convergence(
     assert any("did not converge" in r.text for r in said.reasons) == (change == {"converged": False})
 
 
+@pytest.mark.parametrize(
+    ("share", "said"), [(0.99, "beside it: BL EKF 1.50 m (12 x)."), (0.88, "beside it: BL EKF 1.50 m.")]
+)
+def test_no_ratio_is_given_to_an_error_over_another_time(data: ReportData, share: float, said: str) -> None:
+    """Online had 350 of 400 fixes, without the first gap, in which the filters were worst: 'BL EKF 4.1 x' was of all 400."""
+    columns = ("position_rmse_m", "coverage_95", "matched")
+    table = Table("Against truth", columns, (("graphloc", (0.1234, 0.95, share)), ("BL EKF", (1.5, None, 1.0))))
+    accuracy = verdict(replace(data, tables=(table,))).tracks[0].accuracy
+    assert accuracy.endswith(said)
+    assert ("over the 88 % that it covers" in accuracy) == (share < 0.9)
+
+
 @pytest.mark.parametrize("off_m", [(1.5, -0.4, 0.0), (0.0, 0.0, 0.0)])
 def test_an_error_that_stays_the_same_is_named(data: ReportData, off_m: tuple[float, float, float]) -> None:
     """As of a datum that `inspect` guessed by drifting fixes: it is no noise that is wrong then."""

@@ -34,6 +34,9 @@ _BESIDE_GNSS, _FEWEST_USED = ("pose", "aerial", "apriltag"), 10
 # Of a receiver from the track, beyond any multipath that lasts; and in sigmas of its slow error.
 _APART_M, _APART_SIGMAS = 20.0, 5.0
 _STAYS = 0.5  # what of an error changes, as a share of what stays, up to which the latter is said to be wrong; a choice
+_ALIKE = (
+    0.02  # shares of what is compared that two tracks cover, apart by at most so much, so that a ratio says something
+)
 _WORSE = 1.05  # times a filter's error, from which on ours is said to be larger
 
 
@@ -435,11 +438,21 @@ def _accuracy(data: ReportData, name: str) -> str:
     most = values[name].get(key.replace("rmse", "max"))
     at = " at held-out fixes" if key == "horizontal_rmse_m" else ""
     said = f"Horizontal RMSE {mine:.2f} m{at}" + ("" if most is None else f", worst {most:.2f} m")
+    covered = values[name].get("matched") or 1.0
+    if covered < 1.0 - _ALIKE:
+        said += (
+            f", over the {percent(covered)} of them that it covers"
+            if at
+            else f", over the {percent(covered)} that it covers"
+        )
     others = {n: v for n, row in values.items() if n != name and (v := row[key]) is not None}
+    # No ratio to an error over a time that ours lacks, as that until it starts.
+    alike = {n for n in others if abs((values[n].get("matched") or 1.0) - covered) <= _ALIKE}
     if name != data.solution.name:  # the offline track is no rival: it knows what came later
         others.pop(data.solution.name, None)
     beside = ", ".join(
-        f"{n} {value:.2f} m" + (f" ({times(value, mine)})" if mine > 0.0 else "") for n, value in others.items()
+        f"{n} {value:.2f} m" + (f" ({times(value, mine)})" if mine > 0.0 and n in alike else "")
+        for n, value in others.items()
     )
     return f"{said}; beside it: {beside}." if beside else f"{said}."
 
