@@ -170,7 +170,7 @@ def _elsewhere(bag: Contents, gnss: Sequence[GnssReport]) -> dict[str, str]:
     unfelt = {report.topic for report in gnss if not felt(report)}
     # A filter's output moves as the IMU does, of which it is made.
     aboard = next((report for report in gnss if report.topic not in unfelt and not filtered(report.topic)), None)
-    if aboard is None:
+    if aboard is None or aboard is gnss[0]:
         return {}
     why = f"{imus[0].topic} feels how {aboard.topic} moves, and nothing of how this one does: of another craft"
     base = f"while {aboard.topic} goes {aboard.roams_m:.0f} m, as {imus[0].topic} feels: a base station ashore, or a receiver that hangs"

@@ -32,6 +32,7 @@ def inspect(
 ) -> None:
     """Show what a bag holds and write a first vessel.yaml, with every guess marked."""
     from graphloc.errors import InputError, OutputError
+    from graphloc.folders import check_writable
     from graphloc.frontends import inspect as inspection
 
     found = inspection.inspect_bag(bag)
@@ -41,6 +42,7 @@ def inspect(
         raise InputError(f"{found.source}: no usable sensor in it, so {config} is not written: {why}")
     if config.exists() and not overwrite:
         raise OutputError(f"{config}: exists already; give another --out, or --overwrite")
+    check_writable(config)
     try:
         config.parent.mkdir(parents=True, exist_ok=True)
         config.write_text(inspection.draft_config(found), encoding="utf-8")

@@ -11,7 +11,7 @@ import gtsam
 from graphloc.build import Problem, StartPrior, Thinned, thinned, with_sensor_noise
 from graphloc.recording import Progress
 from graphloc.solve._choices import other_choices, take_more_probable
-from graphloc.solve._passes import Settled, cost_without_outliers, expected_cost, settle
+from graphloc.solve._passes import SETTLED_NATS, Settled, cost_without_outliers, expected_cost, settle
 from graphloc.solve.decide import Stage, Verdicts, weigh
 from graphloc.solve.sensor_noise import scattering
 
@@ -29,7 +29,7 @@ class RunChoice(NamedTuple):
 
     def settled_again(self, prior: StartPrior, progress: Progress) -> SolvedRun:
         """Return the solution that it was made of, with a graph."""
-        return SolvedRun(self.problem, settle(*self, prior, progress, LAST_PASSES))
+        return SolvedRun(self.problem, settle(*self, prior, progress, LAST_PASSES, SETTLED_NATS))
 
 
 class SolvedRun(NamedTuple):
@@ -82,5 +82,5 @@ def _final_passes(
         return replace(settled, iterations=iterations)
     values, verdicts, passes = settled.values, settled.verdicts, settled.passes
     del settled  # and its graph, before the next one is made
-    again = settle(problem, values, verdicts, prior, progress, LAST_PASSES)
+    again = settle(problem, values, verdicts, prior, progress, LAST_PASSES, SETTLED_NATS)
     return replace(again, iterations=iterations + again.iterations, passes=passes + again.passes)

@@ -15,8 +15,8 @@ from graphloc.solve.decide import Stage, Verdicts, decisions, log_evidence, met,
 from graphloc.solve.stretch import moved, unwound
 
 SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1
-# Of the cost, by which a step changes it: half a sigma of what it moves. A heading that nothing tells turns by degrees at each.
-_SETTLED_NATS = 0.1
+SETTLED_NATS = 0.1
+"""Of the cost, by which a step changes it: half a sigma of what it moves. A heading that nothing tells turns by degrees at each."""
 # Of the thinned run: the passes over the whole one begin there and go on to `SETTLED_M`; a choice.
 _ROUGHLY_SETTLED_M = 0.5
 _UPHILL = 1.1  # times the cost before: above it a single step has failed
@@ -37,9 +37,9 @@ class Optimised:
     moved_m: float
     changed_nats: float = float("inf")
 
-    def settled(self) -> bool:
-        """Return whether it moved the track by little, or by little of what is known of it."""
-        return self.moved_m < SETTLED_M or self.changed_nats < _SETTLED_NATS
+    def settled(self, nats: float) -> bool:
+        """Return whether it moved the track by little, or changed the cost by less than so much."""
+        return self.moved_m < SETTLED_M or self.changed_nats < nats
 
 
 def optimise_run(
@@ -84,8 +84,9 @@ def settle(
     prior: StartPrior,
     progress: Progress,
     most: int,
+    nats: float = 0.0,
 ) -> Settled:
-    """Run passes until modes and weights no longer change, at most `most`."""
+    """Run passes until modes and weights no longer change, at most `most`, nor the track; or the cost by `nats`, wherever the track goes."""
     last, iterations = len(problem.timeline) - 1, 0
     done: Optimised | None = None
     for n in range(most):
@@ -96,7 +97,7 @@ def settle(
         used, verdicts = verdicts, weigh(problem, estimate, first=0, last=last, stage=Stage.FINAL)
         _date(verdicts, used, n + 1)
         progress("final passes", n + 1, most)
-        if estimate is done.values and n > 0 and done.settled() and changed(used, verdicts) < SETTLED_WEIGHT:
+        if estimate is done.values and n > 0 and done.settled(nats) and changed(used, verdicts) < SETTLED_WEIGHT:
             break
     assert done is not None
     return Settled(
@@ -106,7 +107,7 @@ def settle(
         verdicts=verdicts,
         passes=n + 1,
         iterations=iterations,
-        converged=done.moved_m < 3 * SETTLED_M or done.settled(),
+        converged=done.moved_m < 3 * SETTLED_M or done.settled(nats),
     )
 
 
