@@ -34,9 +34,8 @@ _BESIDE_GNSS, _FEWEST_USED = ("pose", "aerial", "apriltag"), 10
 # Of a receiver from the track, beyond any multipath that lasts; and in sigmas of its slow error.
 _APART_M, _APART_SIGMAS = 20.0, 5.0
 _STAYS = 0.5  # what of an error changes, as a share of what stays, up to which the latter is said to be wrong; a choice
-_ALIKE = (
-    0.02  # shares of what is compared that two tracks cover, apart by at most so much, so that a ratio says something
-)
+# Shares of what is compared that two tracks cover, apart by at most so much, so that a ratio says something; online starts seconds later.
+_ALIKE = 0.1
 _WORSE = 1.05  # times a filter's error, from which on ours is said to be larger
 
 
