@@ -119,12 +119,10 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     imus, in_body = _in_axes_up(bag, gnss, _imu_reports(bag, evidence))
     best = _best_imu(bag, imus, evidence)
     compasses = compasses_of(bag, courses, best)
-    taken, imus = (
-        imus,
-        [turned_as_its_heading(imu, compasses) for imu in _beside_headings(bag, imus, evidence, compasses)],
-    )
-    if imus and imus[0] is not taken[0]:
-        best = _best_imu(bag, imus, evidence)
+    ranked = _beside_headings(bag, imus, evidence, compasses)
+    turned = [turned_as_its_heading(imu, compasses) for imu in ranked]
+    if turned and turned[0] is not imus[0]:
+        best = _best_imu(bag, turned, evidence)
     velocities = [(s, with_side(report, s, best.felt if best else None)) for s, report in velocities]
     late = {motion.source: motion_time_offset(best.felt, motion) for motion in motions} if best else {}
     timed = [timed_fixes(report, late, motions, velocities, bag.streams) for report in gnss]
@@ -135,9 +133,9 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     return Inspection(
         source=bag.source,
         topics=_topic_reports(bag),
-        imus=tuple(imus),
+        imus=tuple(turned),
         gnss=_with_wander(bag, timed, odometry, velocities, motions),
-        compasses=tuple(with_own_north(compass, imus) for compass in compasses),
+        compasses=tuple(with_own_north(compass, turned) for compass in compasses),
         odometry=tuple(reports),
         velocities=tuple(timed_velocity(report, late.get(report.topic), together) for _, report in velocities),
         lidars=lidars_of(bag),
@@ -145,7 +143,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
         tf_frames=bag.tree.frames,
         body_frame=bag.tree.body(),
         in_body=in_body,
-        warnings=(*bag.warnings, *_warnings(bag, gnss, imus, compasses, reports)),
+        warnings=(*bag.warnings, *_warnings(bag, gnss, turned, compasses, reports)),
     )
 
 

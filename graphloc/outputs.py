@@ -31,7 +31,7 @@ from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.plain import plain
 from graphloc.recording import Span
-from graphloc.solution import Health, Solution
+from graphloc.solution import LOST_BOUND_M, Solution
 from graphloc.time import utc_text
 from graphloc.trajectory import bounds_95
 
@@ -139,6 +139,7 @@ def _bag(path: Path, solution: Solution, picked: Array, body_frame: str) -> None
     assert track.v_world_mps is not None
     geodetic = solution.datum.geodetic_from_enu(track.p_world_m[picked])
     quaternions = Rotation.from_matrix(track.R_world_body[picked]).as_quat()
+    bounds_m = bounds_95(track.cov)[:, 0]
     point, vector, quaternion = (t[f"geometry_msgs/msg/{n}"] for n in ("Point", "Vector3", "Quaternion"))
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         odometry = writer.add_connection("/graphloc/odometry", "nav_msgs/msg/Odometry", typestore=store)
@@ -169,7 +170,7 @@ def _bag(path: Path, solution: Solution, picked: Array, body_frame: str) -> None
             )
             writer.write(odometry, stamp, store.serialize_cdr(message, "nav_msgs/msg/Odometry"))
             status = t["sensor_msgs/msg/NavSatStatus"](
-                status=_NO_FIX if solution.health[k] is Health.LOST else _FIX, service=1
+                status=_NO_FIX if bounds_m[k] > LOST_BOUND_M else _FIX, service=1
             )
             position = t["sensor_msgs/msg/NavSatFix"](
                 header=t["std_msgs/msg/Header"](stamp=time, frame_id=body_frame),

@@ -21,19 +21,24 @@ CONTRADICTING_COST = 3.0
 """Cost over the expected one, above which measurements contradict each other: noise that is configured too small alone costs less."""
 
 
+LOST_BOUND_M = 25.0
+"""95 % bound beyond which a position helps nobody in a harbour."""
+
+
 class Health(enum.StrEnum):
     """How far an estimate can be trusted, at one time."""
 
     GOOD = "good"  # position sigma small, absolute sensors agree
     DEGRADED = "degraded"  # usable, but one absolute sensor is missing or disagrees, or sigma is large
     DEAD_RECKONING = "dead_reckoning"  # no absolute position agreed for a while
-    LOST = "lost"  # the covariance, or the solver, says that the pose is not known
+    LOST = "lost"  # by the covariance position or heading is not known
 
 
 class Cause(enum.Enum):
     """What keeps an estimate from being good: what would have to change."""
 
-    BOUND = enum.auto()  # its 95 % bound is too large
+    BOUND = enum.auto()  # the 95 % bound of its position is too large
+    HEADING = enum.auto()  # that of its heading alone is
     NO_POSITION = enum.auto()  # no absolute sensor agrees
     SENSORS = enum.auto()  # some absolute sensors are missing or do not agree
     GUESSED_HEADING = enum.auto()  # no sensor measures the heading, and the motion does not tell it yet

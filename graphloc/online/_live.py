@@ -280,6 +280,11 @@ class LiveProblem:
     streams: dict[str, LiveStream]
     motion_model: MotionModel
 
+    def others_of_place(self, name: str) -> list[LiveStream]:
+        """Return the other sensors of position, without those that read the same receiver by turns."""
+        same = self.config.by_turns(name)
+        return [s for s in self.streams.values() if s.row.absolute and s.name not in (name, *same)]
+
     def take(self, m: Measurement) -> tuple[LiveStream, int]:
         """Attach a measurement to its state; return its stream and its index there."""
         stream = self.streams[m.sensor]

@@ -97,13 +97,8 @@ class ReceiverChecks:
 
     def _is_alone(self, stream: LiveStream) -> bool:
         """Return whether no other sensor holds the place: one that is silent, as cameras are until the berth is in sight, does not either."""
-        heard = [s for s in self._others(stream) if len(s.measurements) > s.measurements.first]
+        heard = [s for s in self._problem.others_of_place(stream.name) if len(s.measurements) > s.measurements.first]
         return only_position_sensor(stream, [stream, *heard])
-
-    def _others(self, stream: LiveStream) -> list[LiveStream]:
-        """Return the other sensors of position, without those that read the same receiver by turns."""
-        same = self._problem.config.by_turns(stream.name)
-        return [s for s in self._problem.streams.values() if s.row.absolute and s.name not in (stream.name, *same)]
 
     def _off(self, stream: LiveStream, at: Attachment, residual: Residual, off_m: Array) -> OffPrediction | None:
         """Return how the newest fix lies to its prediction; None where the receiver's slow error is switched off, or cannot jump.
@@ -113,7 +108,7 @@ class ReceiverChecks:
         Args:
             off_m: (2,) of the fix from the estimated place, slow error aside.
         """
-        slow = stream.left_out or (stream.slow if self._others(stream) else None)
+        slow = stream.left_out or (stream.slow if self._problem.others_of_place(stream.name) else None)
         if slow is None or not slow.jumps or stream.receiver.jump.jumps != stream.jumps:
             return None
         without = residual.raw
