@@ -65,11 +65,12 @@ class TagsSeen:
     def _place_camera(self, m: TagSighting, at: Attachment) -> None:
         T_state_camera = at.T_state_sensor.compose(gtsam.Pose3(gtsam.Rot3(m.R_body_camera), m.t_body_camera_m))
         T_world_camera = at.T_world_body.compose(T_state_camera)
-        self.R, self.p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation())
+        self.R, self.p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation()) + at.carried_m
         adjoint = np.asarray(T_state_camera.inverse().AdjointMap())
         self.body = np.vstack([self.R @ adjoint[3:], self.R @ adjoint[:3]])
         self.by_mount, self.by_late = np.eye(3), np.zeros(6)
-        R_world_body, arm = self.R @ m.R_body_camera.T, self.p - np.asarray(at.T_world_body.translation())
+        R_world_body = self.R @ m.R_body_camera.T
+        arm = self.p - at.carried_m - np.asarray(at.T_world_body.translation())
         off, late_s = self.slow[6 * self.rides :][:3], self.slow[6 * self.rides + 3 * self.mounted :][: int(self.timed)]
         if self.timed:
             rate = R_world_body @ at.gyro_radps

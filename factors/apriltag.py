@@ -135,7 +135,7 @@ def ideal(at: Attachment, config: AprilTagConfig) -> TagSighting:
         gtsam.Pose3(gtsam.Rot3(R_body_camera), t_body_camera)
     )
     docks = docks_of(survey) if at.slow_value is not None else []
-    R, p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation())
+    R, p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation()) + at.carried_m
     corners = np.array([(-0.2, -0.2, 4.1), (0.2, -0.2, 3.9), (0.2, 0.2, 3.9), (-0.2, 0.2, 4.1)])
     now = p + corners @ R.T
     moved = np.asarray(at.slow_value)[:6] if docks else np.zeros(6)

@@ -65,7 +65,7 @@ def _axis(at: Attachment) -> tuple[Array, Array, Array]:
 
 def _yaw(at: Attachment, x_world: Array) -> float:
     """Return y, rad; `x_world`: of the sensor (3,)."""
-    return math.atan2(x_world[1], x_world[0]) - float(at.datum.convergence_rad(at.T_world_body.translation()))
+    return math.atan2(x_world[1], x_world[0]) - float(at.datum.convergence_rad(at.body_m))
 
 
 def _read(at: Attachment, config: CompassConfig, yaw: float) -> tuple[float, Array]:

@@ -68,7 +68,7 @@ def _fix_world_m(m: GnssPosition, at: Attachment) -> Array:
 def _predicted_m(at: Attachment, config: GnssConfig) -> Array:
     """The fix (3,) without white noise, in world."""
     late, off = late_and_off(at, config)
-    place = at.T_world_body.transformFrom(at.T_state_sensor.transformFrom(off))
+    place = at.sensor_m(off)
     if at.slow_value is not None:
         place = place - at.slow_value
     if late:
@@ -111,7 +111,7 @@ def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decis
     """Return the native factors of one fix; None where the linear one serves better."""
     if at.constants or (at.slow_key is not None and at.T_solver is None):
         return None
-    z = _fix_world_m(m, at)
+    z = _fix_world_m(m, at) - at.carried_m
     lever = np.asarray(at.T_state_sensor.translation())
     model = noise_model(white_covariance(m, config) + at.walked(), decision)
     if at.slow_key is None:

@@ -34,13 +34,12 @@ def _fall_m(p_world_m: Array) -> float:
 
 def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Residual, ...]:
     """Return predicted - expected (1,), m."""
-    lever = np.asarray(at.T_state_sensor.translation())
-    point = at.T_world_body.transformFrom(lever)
+    point = at.sensor_m()
     tide = 0.0 if at.slow_value is None else float(at.slow_value[0])
     raw = np.array([point[2] + _fall_m(point) - tide - m.height_m])
 
     def jacobian() -> Array:
-        up = at.T_world_body.rotation().matrix()[2]
+        up, lever = at.T_world_body.rotation().matrix()[2], np.asarray(at.T_state_sensor.translation())
         return np.concatenate([skew(lever) @ up, up])[None, :]
 
     return (
@@ -63,14 +62,15 @@ def factors(m: HeightPrior, config: HeightConfig, at: Attachment, decision: Deci
     sigmas = np.array([_WIDE_M, _WIDE_M, m.sigma_m / np.sqrt(decision.weight)])
     model = robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas), decision.kernel)
     lever = np.asarray(at.T_state_sensor.translation())
-    target = np.array(at.T_world_body.transformFrom(lever))
+    target = at.sensor_m()
     target[2] = m.height_m - _fall_m(target)
+    target -= at.carried_m
     return GraphUpdate(factors=(gtsam.GPSFactorArm(at.pose_key, target, lever, model),))
 
 
 def ideal(at: Attachment, config: HeightConfig) -> HeightPrior:
     """Return the noise-free height at the attachment's state."""
-    point = at.T_world_body.transformFrom(at.T_state_sensor.translation())
+    point = at.sensor_m()
     tide = 0.0 if at.slow_value is None else float(at.slow_value[0])
     height_m = float(point[2]) + _fall_m(point) - tide
     return HeightPrior(stamp_ns=0, sensor="height", seq=0, height_m=height_m, sigma_m=config.sigma_m)

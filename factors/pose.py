@@ -4,7 +4,7 @@
 The measured axes replace those of the current estimate of the sensor's pose; the result, moved to the
 body, anchors a native `PriorFactorPose3` whose unmeasured axes are wide:
 
-    Z = T_world_sensor(measured axes) ;  anchor = Z T_state_sensor^-1 ;  e = Log(anchor^-1 T_world_body)
+    Z = T_world_sensor(measured axes), less `carried_m` ;  anchor = Z T_state_sensor^-1 ;  e = Log(anchor^-1 T_world_body)
 
 Exact when re-anchored (measured: anchored level it is 11 % wrong at 3 deg of roll and pitch), which
 the solver does every pass. Rotation errors are small rotations about the world's axes, as in ROS.
@@ -43,6 +43,10 @@ def _covariance(mode: PoseMode, axes: tuple[str, ...], config: AnyPoseConfig) ->
     return with_floors(scale[:, None] * mode.cov * scale, floors**2)
 
 
+def _sensor_pose(at: Attachment) -> Any:
+    return gtsam.Pose3(at.T_world_body.rotation().compose(at.T_state_sensor.rotation()), at.sensor_m())
+
+
 def _measured_sensor_pose(mode: PoseMode, axes: tuple[str, ...], T_world_sensor: Any) -> Any:
     """Return T_world_sensor with the measured axes replaced."""
     values = np.concatenate([T_world_sensor.translation(), T_world_sensor.rotation().rpy()])
@@ -53,7 +57,7 @@ def _measured_sensor_pose(mode: PoseMode, axes: tuple[str, ...], T_world_sensor:
 
 def without_slow(m: PoseFix, config: AnyPoseConfig, at: Attachment) -> tuple[Residual, ...]:
     """Return predicted - measured (k,), m and rad, for each mode, as if nothing slow were added to what is measured."""
-    T_world_sensor = at.T_world_body.compose(at.T_state_sensor)
+    T_world_sensor = _sensor_pose(at)
     R = T_world_sensor.rotation().matrix()
     picked = [AXES.index(a) for a in m.axes]
     world = _world_jacobian(R, at.T_state_sensor)
@@ -169,7 +173,7 @@ def factors(m: PoseFix, config: AnyPoseConfig, at: Attachment, decision: Decisio
     if at.slow_key is not None:
         return None
     mode = m.modes[decision.mode]
-    T_world_sensor = at.T_world_body.compose(at.T_state_sensor)
+    T_world_sensor = _sensor_pose(at)
     Z = _measured_sensor_pose(mode, m.axes, T_world_sensor)
     # Whitened rows of d(world translation, world rotation of the sensor) / d(body tangent). Built as a
     # square root: inverting a covariance with 1 km and 0.1 deg in it leaves spurious information behind,
@@ -179,7 +183,7 @@ def factors(m: PoseFix, config: AnyPoseConfig, at: Attachment, decision: Decisio
     root = np.diag([1.0 / _WIDE_M] * 3 + [1.0 / _WIDE_RAD] * 3)
     cov = _covariance(mode, m.axes, config) / decision.weight
     root[np.ix_(picked, picked)] = gauss.whitening(cov)
-    anchor = Z.compose(at.T_state_sensor.inverse())
+    anchor = gtsam.Pose3(Z.rotation(), Z.translation() - at.carried_m).compose(at.T_state_sensor.inverse())
     upper = np.linalg.qr(root @ rows)[1]
     upper *= np.sign(np.diagonal(upper))[:, None]  # GTSAM takes a diagonal one for sigmas, and these are positive
     base = gtsam.noiseModel.Gaussian.SqrtInformation(upper)
@@ -194,7 +198,7 @@ def _world_jacobian(R_world_sensor: Array, T_state_sensor: Any) -> Array:
 
 def ideal_without_slow(at: Attachment, config: AnyPoseConfig) -> PoseFix:
     """Return the noise-free pose at the attachment's state, as if nothing slow were added to it."""
-    T = at.T_world_body.compose(at.T_state_sensor)
+    T = _sensor_pose(at)
     values = np.concatenate([T.translation(), T.rotation().rpy()])
     sigmas = np.where(np.arange(6) < 3, 0.3, np.radians(2.0))
     picked = [AXES.index(a) for a in config.axes]

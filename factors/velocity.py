@@ -28,7 +28,7 @@ from graphloc.measurements import GnssVelocity
 
 def _to_local(at: Attachment) -> Array:
     """L' (3, 3)."""
-    return at.datum.local_axes(at.T_world_body.translation()).T
+    return at.datum.local_axes(at.body_m).T
 
 
 def _predicted_mps(at: Attachment, config: VelocityConfig) -> Array:

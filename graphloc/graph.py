@@ -54,9 +54,10 @@ class FeltMotion(NamedTuple):
 class Attachment:
     """Where a measurement meets the graph, and what the graph believes there now.
 
-    A measurement between two states is carried to the nearest one with the IMU's own relative motion:
-    `T_state_sensor` is the pose of the sensor at the measurement's stamp, seen from the body at the
-    state. Carrying is thus the same thing as a mount.
+    A measurement between two states is carried to the nearest one with the IMU's own relative motion. How the body turned until the
+    measurement, and where the sensor sits on it, turn with the attitude at the state: together they are `T_state_sensor`, as if the
+    sensor were mounted so. The way that the body went (`carried_m`) is not in it, as it does not turn with that attitude: written as part
+    of the mount, it would hold the heading at what is estimated now (fixes of centimetres at 20 Hz, to some tenths of a degree).
 
     Attributes:
         pose_key, velocity_key: keys of the state.
@@ -65,7 +66,7 @@ class Attachment:
         T_world_body: estimate at the state: body axes, origin at the IMU (see `graphloc.build`). v_world_mps: of its velocity (3,).
         T_solver: where a solver that goes on from older linearisations linearises the pose (see `graphloc.linear`); None: at the
             estimate, as all factors are written anew at every pass.
-        T_state_sensor: see above (gtsam.Pose3).
+        T_state_sensor: see above (gtsam.Pose3). carried_m: (3,) world axes, as estimated.
         dv_world_mps: (3,) what velocity gains from the state to the measurement.
         gyro_radps: (3,) body rate at the measurement, body axes, bias removed.
         lever_m: (3,) sensor origin from the IMU, body axes.
@@ -87,6 +88,7 @@ class Attachment:
     T_world_body: Any
     v_world_mps: Array
     T_state_sensor: Any
+    carried_m: Array
     dv_world_mps: Array
     gyro_radps: Array
     lever_m: Array
@@ -114,6 +116,16 @@ class Attachment:
             return 0.0
         walk = np.diag(self.slow_walk)
         return walk if shown is None else np.asarray(shown @ walk @ shown.T)
+
+    @property
+    def body_m(self) -> Array:
+        """Position (3,) of the body at the measurement, in world, m."""
+        return np.asarray(self.T_world_body.translation() + self.carried_m)
+
+    def sensor_m(self, off_m: Array | None = None) -> Array:
+        """Return the position (3,) of the sensor at the measurement, in world, m; `off_m`: see `swing_mps`."""
+        at_state = self.T_state_sensor.translation() if off_m is None else self.T_state_sensor.transformFrom(off_m)
+        return np.asarray(self.T_world_body.transformFrom(at_state) + self.carried_m)
 
     def swing_mps(self, off_m: Array | None = None) -> Array:
         """Return the velocity (3,) of the sensor by the turning of the body, w x l, body axes, m/s.

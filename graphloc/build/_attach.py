@@ -199,13 +199,14 @@ def attach(problem: Sited, stream: Attaching, i: int, values: Estimates) -> Atta
     T = values.atPose3(keys.pose(k))
     v = values.atVector(keys.velocity(k))
     bias = values.atConstantBias(keys.bias(j))
-    T_state_sensor, dv, carried_to = stream.mount, np.zeros(3), None
+    T_state_sensor, carried_m, dv, carried_to = stream.mount, np.zeros(3), np.zeros(3), None
     carried = stream.carry[i]
     if carried is not None:
         floor, pim = carried
         there = pim.predict(gtsam.NavState(T, v) if floor == k else nav_state(values, floor), bias)
         carried_to = T.between(there.pose())
-        T_state_sensor = carried_to.compose(stream.mount)
+        T_state_sensor = gtsam.Pose3(carried_to.rotation(), np.zeros(3)).compose(stream.mount)
+        carried_m = np.asarray(there.position()) - T.translation()
         dv = np.asarray(there.velocity()) - v
     slow_key = None if stream.slow is None else keys.slow(stream.number, j)
     return Attachment(
@@ -216,6 +217,7 @@ def attach(problem: Sited, stream: Attaching, i: int, values: Estimates) -> Atta
         T_world_body=T,
         v_world_mps=v,
         T_state_sensor=T_state_sensor,
+        carried_m=carried_m,
         dv_world_mps=dv,
         gyro_radps=stream.gyro_radps[i] - problem.R_body_imu @ bias.gyroscope(),
         lever_m=np.asarray(stream.mount.translation()),

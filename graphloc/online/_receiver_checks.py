@@ -157,5 +157,5 @@ def _antenna(stream: LiveStream, at: Attachment) -> tuple[Array, Array]:
     off_m = antenna_off_m(found)
     off_m = np.zeros(3) if off_m is None else off_m
     v_mps = at.sensor_velocity_mps(off_m)
-    place = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.transformFrom(off_m)))
+    place = at.sensor_m(off_m)
     return place[:2] + v_mps[:2] * found.get(TIME_OFFSET, 0.0), v_mps
