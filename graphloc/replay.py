@@ -160,7 +160,6 @@ def replay(
     speed: float | None = None,
     lag_s: float = 10.0,
     datum: Datum | None = None,
-    smoother: OnlineSmoother | None = None,
     late_ns: Mapping[int, int] | None = None,
     stoppable: bool = False,
     status: Status = silent,
@@ -170,13 +169,13 @@ def replay(
     Args:
         scans: scans to match for the aerial sensors; None: use the matches in the recording.
         speed: times real time; None: as fast as possible. datum: origin of world; None: as `OnlineSmoother` finds it.
-        smoother: to use instead of a new one, for tests. late_ns: as for `arrivals`.
+        late_ns: as for `arrivals`.
         stoppable: Ctrl-C ends the replay early, and the result up to then is returned, if it had started.
 
     Raises:
         SolveError: it never started. InputError: a map or LiDAR that cannot be used.
     """
-    smoother = smoother or OnlineSmoother(
+    smoother = OnlineSmoother(
         config, rows=SENSORS, inertial=INERTIAL, datum=datum, mounts=recording.mounts, lag_s=lag_s
     )
     if scans is not None:

@@ -323,9 +323,9 @@ def match_at(
     return item.match, item.stamp_ns
 
 
-def simulated(run: SimulatedRun, *, compare: bool = False, progress: Progress = quiet) -> Run:
+def simulated(run: SimulatedRun, *, compare: bool = False) -> Run:
     """Smooth a simulated run."""
-    return smooth_recording(run.recording, run.config, compare=compare, progress=progress)
+    return smooth_recording(run.recording, run.config, compare=compare)
 
 
 def choose_datum(recording: Recording, config: VesselConfig) -> Datum:

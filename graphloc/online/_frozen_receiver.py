@@ -71,7 +71,7 @@ class FrozenReceiverDetector:
         of_vessel_mps = _SHARE * float(np.linalg.norm(v_mps))
         least = max(_LEAST_MPS, of_vessel_mps)
         if self.frozen:  # the growing uncertainty of the velocity without it is no evidence that it moves
-            moves_mps, noise_m, noise_mps = _motion(t[late], told[late], sigma_m)
+            moves_mps, _, noise_mps = _motion(t[late], told[late], sigma_m)
             stands = moves_mps < _STANDS_MPS + _SIGMAS * noise_mps
             self.frozen = stands and speed > 0.5 * least and not self._has_left(told[late])
             return
