@@ -32,7 +32,7 @@ from graphloc.ledger import LedgerRow
 from graphloc.plain import plain
 from graphloc.recording import Span
 from graphloc.solution import LOST_BOUND_M, Solution
-from graphloc.time import utc_text
+from graphloc.time import NS_PER_S, seconds_text, utc_text
 from graphloc.trajectory import bounds_95
 
 _NO_FIX, _FIX = -1, 0  # of NavSatStatus
@@ -125,9 +125,8 @@ def _tum(path: Path, solution: Solution, picked: Array) -> None:
     quaternions = Rotation.from_matrix(track.R_world_body[picked]).as_quat()
     with path.open("w", encoding="ascii") as stream:
         for k, q in zip(picked, quaternions, strict=True):
-            whole, rest = divmod(int(track.stamps_ns[k]), 1_000_000_000)
             values = " ".join(f"{v:.9f}" for v in (*track.p_world_m[k], *q))
-            stream.write(f"{whole}.{rest:09d} {values}\n")
+            stream.write(f"{seconds_text(int(track.stamps_ns[k]))} {values}\n")
 
 
 def _bag(path: Path, solution: Solution, picked: Array, body_frame: str) -> None:
@@ -147,7 +146,7 @@ def _bag(path: Path, solution: Solution, picked: Array, body_frame: str) -> None
         for i, k in enumerate(picked):
             stamp = int(track.stamps_ns[k])
             R = track.R_world_body[k]
-            time = t["builtin_interfaces/msg/Time"](sec=stamp // 1_000_000_000, nanosec=stamp % 1_000_000_000)
+            time = t["builtin_interfaces/msg/Time"](sec=stamp // NS_PER_S, nanosec=stamp % NS_PER_S)
             twist_cov = np.zeros((6, 6))
             twist_cov[:3, :3], twist_cov[3:, 3:] = R.T @ solution.v_cov[k] @ R, solution.gyro_cov[k]
             message = t["nav_msgs/msg/Odometry"](

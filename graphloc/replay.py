@@ -29,7 +29,7 @@ from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
 from graphloc.solution import Cause, Solution, SolveStats
 from graphloc.solve.warnings import disagreement_warning, joint_rejection_warning
-from graphloc.time import stamps_of
+from graphloc.time import NS_PER_S, stamps_of
 from graphloc.trajectory import Trajectory
 
 Status = Callable[[float, float, Estimate | None, str], None]
@@ -146,7 +146,7 @@ class _Session:
 
     def _show_waiting(self, stamp_ns: int) -> None:
         """Report once per second of the run what the start waits for."""
-        second = (stamp_ns - self.first_ns) // 1_000_000_000
+        second = (stamp_ns - self.first_ns) // NS_PER_S
         if self.smoother.waiting_for and second != self._shown_s:
             self._shown_s = second
             self._status(float(second), self._length_s, None, self.smoother.waiting_for)
