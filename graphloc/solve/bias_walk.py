@@ -28,7 +28,9 @@ WANDERS_S = 60.0
 """Time over which it is looked at how far a bias has gone."""
 KEYS = ("accel_bias_instability_ug", "gyro_bias_instability_deg_per_h")
 """What is configured of accelerometers and gyroscopes."""
-_WANDERS = 3.0  # sigmas of its random walk over that: smoothed, a bias that walks so moves by less than two
+# Sigmas of its random walk over that, from which variance components are asked whether it needs more walk (`_UNLIKELY`): smoothed, a
+# bias that walks so moves by less than two. A warning alone, where the walk is not to be raised, has no such test and a higher bound.
+_LOOKED_AT = 3.0
 # Probabilities: of some ten looks every ten seconds one finds it by chance about once in 150 h; and that of each part of the time.
 _TOO_FAR, _A_PART = 1e-6, 0.01
 _MOST_STEP, _LEAST_STEP = 10.0, 1.3  # what is known is too sure as well, so more is not believed at once
@@ -140,7 +142,7 @@ def _needed(gone: Array) -> float:
 
 def with_needed_walk(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Problem | None:
     """Return the problem with as much walk of the biases as the run needs, where that is clearly more than it has; else None."""
-    high = wandered(problem, values) > _WANDERS
+    high = wandered(problem, values) > _LOOKED_AT
     if not high.any():
         return None
     rows = linearised(problem, values, verdicts, prior)
