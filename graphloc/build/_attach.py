@@ -14,9 +14,9 @@ from graphloc.build._chains import walk_between_nodes
 from graphloc.config import VesselConfig
 from graphloc.frames import Array, Datum
 from graphloc.graph import TIME_OFFSET, Attachment, Constant, FeltMotion, InertialLink, Sensor, SlowProcess
-from graphloc.measurements import Measurement
+from graphloc.measurements import NO_HEIGHT_M2, Measurement
 
-_NO_HEIGHT_M2 = np.array([0.0, 0.0, 1e12])  # adds to a fix what leaves its height without weight
+_NO_HEIGHT_M2 = np.array([0.0, 0.0, NO_HEIGHT_M2])  # adds to a fix what leaves its height without weight
 
 Carry = tuple[int, Any]
 """Number of a state, and the motion preintegrated from there to a measurement."""
