@@ -184,11 +184,12 @@ def test_keys_are_those_of_gtsam() -> None:
         assert keys.pose(k) == gtsam.symbol("x", k)
         assert keys.velocity(k) == gtsam.symbol("v", k)
         assert keys.bias(k) == gtsam.symbol("b", k)
-        assert keys.leaves(k) == (gtsam.symbol("a", k), gtsam.symbol("l", k))
+        assert keys.leaves(0, k) == (gtsam.symbol("a", k), gtsam.symbol("l", k))
         for number in (0, 5, 30):
             assert keys.slow(number, k) == gtsam.LabeledSymbol(ord("s"), ord("A") + number, k).key()
             assert keys.constant(number, k) == gtsam.LabeledSymbol(ord("c"), ord("A") + number, k).key()
-    names = [keys.pose(3), keys.velocity(4), keys.bias(5), keys.slow(30, 6), keys.constant(7, 8), keys.leaves(9)[1]]
+    names = [keys.pose(3), keys.velocity(4), keys.bias(5), keys.slow(30, 6), keys.constant(7, 8), keys.leaves(0, 9)[1]]
+    assert keys.leaves(2, 9) == (gtsam.symbol("a", 200_000_009), gtsam.symbol("l", 200_000_009))
     letters, numbers = keys.parts(np.array(names, dtype=np.uint64))
     assert letters.tolist() == list("xvbscl")
     assert numbers.tolist() == [3, 4, 5, 6, 8, 9]

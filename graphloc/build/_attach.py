@@ -213,7 +213,7 @@ def attach(problem: Sited, stream: Attaching, i: int, values: Estimates) -> Atta
         pose_key=keys.pose(k),
         velocity_key=keys.velocity(k),
         slow_key=slow_key,
-        leaf_keys=keys.leaves(stream.number * 100_000_000 + i),
+        leaf_keys=keys.leaves(stream.number, i),
         T_world_body=T,
         v_world_mps=v,
         T_state_sensor=T_state_sensor,
