@@ -18,7 +18,7 @@ from graphloc.eval.report._track_verdict import _late_velocity, main_table
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import GnssPosition
-from graphloc.signals.frozen_receiver import WHY
+from graphloc.signals.frozen_receiver import FROZEN_FIX
 from graphloc.solution import Cause, Health, HealthReason, Solution
 from graphloc.solve.health import health_of
 from graphloc.trajectory import Trajectory
@@ -309,7 +309,9 @@ def test_what_a_frozen_receiver_repeats_contradicts_nothing(data: ReportData) ->
     fixes = [m for m in data.recording.measurements if m.sensor == "gnss"]
     solution = replace(data.solution, trajectory=moved(data.solution.trajectory, 0.6, 30.0))
     repeated = {m.seq for m in fixes[: len(fixes) * 2 // 3]}
-    rows = [replace(r, reason=WHY, outcome=Outcome.REJECTED) if r.seq in repeated else r for r in solution.ledger]
+    rows = [
+        replace(r, reason=FROZEN_FIX, outcome=Outcome.REJECTED) if r.seq in repeated else r for r in solution.ledger
+    ]
     for ledger, trust in ((solution.ledger, Trust.NO), (Ledger(rows), Trust.YES)):
         found = verdict(replace(data, solution=replace(solution, ledger=ledger))).tracks[0]
         assert found.trust is trust

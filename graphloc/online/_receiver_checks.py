@@ -17,7 +17,7 @@ from graphloc.online._entries import Entries
 from graphloc.online._frozen_receiver import WINDOW_S
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import States
-from graphloc.signals.frozen_receiver import FROZEN, WHY_VELOCITY
+from graphloc.signals.frozen_receiver import FROZEN, FROZEN_VELOCITY
 from graphloc.signals.position_jumps import (
     OffPrediction,
     allowed_jump_m,
@@ -28,7 +28,7 @@ from graphloc.signals.position_jumps import (
 from graphloc.time import NS_PER_S
 
 _FITS = 3.0  # sigmas of a fix alone
-_FROZEN = f"{FROZEN}: it repeats one position while the vessel moves"
+FROZEN_ONLINE = f"{FROZEN}: it repeats one position while the vessel moves"
 _OLD = "it repeats the fix before it while the vessel moves"
 _OFF = "off what the IMU predicts: an outlier, or a position jump too short to tell"
 
@@ -56,16 +56,16 @@ class ReceiverChecks:
         if np.isfinite(hint.v_world_mps).all():
             repeated = stream.receiver.repeated_velocity
             repeated.note(m.stamp_ns, hint.v_world_mps)
-            return WHY_VELOCITY if repeated.is_old(m.stamp_ns, hint.v_world_mps) else ""
+            return FROZEN_VELOCITY if repeated.is_old(m.stamp_ns, hint.v_world_mps) else ""
         told_m = hint.p_world_m[:2]
         if not stream.row.absolute or not np.isfinite(told_m).all():
             return ""
         estimated_m, v_mps = _antenna(stream, at)
         if self._repeats(stream, m, at, told_m, v_mps):
-            return _FROZEN if stream.receiver.repeated_fix.frozen else _OLD
+            return FROZEN_ONLINE if stream.receiver.repeated_fix.frozen else _OLD
         sigma_m = largest_sigma(residual.white_cov)
         if self._is_frozen(stream, m, told_m, estimated_m, sigma_m):
-            return _FROZEN
+            return FROZEN_ONLINE
         if not self._is_alone(stream):
             stream.receiver.jump.let_go()
             return ""
@@ -80,7 +80,9 @@ class ReceiverChecks:
         since_ns = detector.note(m.stamp_ns, told_m, v_mps, largest_sigma(newest.velocity_cov))
         if since_ns is not None:
             self._reject_since(stream, since_ns, m.stamp_ns)
-            self._warnings.append(f"{stream.name}: {_FROZEN}: for {(m.stamp_ns - since_ns) / NS_PER_S:.1f} s until now")
+            self._warnings.append(
+                f"{stream.name}: {FROZEN_ONLINE}: for {(m.stamp_ns - since_ns) / NS_PER_S:.1f} s until now"
+            )
         return detector.is_old(m.stamp_ns, told_m)
 
     def _is_frozen(self, stream: LiveStream, m: Measurement, told_m: Array, estimated_m: Array, sigma_m: float) -> bool:
@@ -138,7 +140,7 @@ class ReceiverChecks:
         stream.receiver.jump.forget_since(since_ns)
         for entry in self._entries.of(stream):
             if since_ns <= entry.measurement.stamp_ns < until_ns:
-                self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0, reason=_FROZEN))
+                self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0, reason=FROZEN_ONLINE))
 
     def warnings(self) -> list[str]:
         """Return a line on each receiver whose position has jumped, or turned out to have been frozen, since this was last asked."""

@@ -34,8 +34,8 @@ from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._waiting import Waiting
 from graphloc.origin import refuse_world_without_datum
 from graphloc.recording import Mounts
-from graphloc.signals.frozen_imu import WHY
-from graphloc.signals.imu_spikes import WHY as SPIKE
+from graphloc.signals.frozen_imu import FROZEN_IMU
+from graphloc.signals.imu_spikes import IMU_SPIKE
 from graphloc.signals.thinning import THINNED, Thinning
 from graphloc.solve.warnings import slow_error_warning
 from graphloc.time import duration_ns, utc_text
@@ -251,9 +251,9 @@ class OnlineSmoother:
         if taken.absurd and self._tracking is None:
             self._waiting.why = f"IMU data that a vessel can have: {taken.absurd}"
         if taken.newly_frozen:
-            self._say(f"{m.sensor}: {WHY}; treated as an IMU gap until the samples change")
+            self._say(f"{m.sensor}: {FROZEN_IMU}; treated as an IMU gap until the samples change")
         if taken.newly_spiked:
-            self._say(f"{m.sensor}: a sample is {SPIKE}; all such are rejected")
+            self._say(f"{m.sensor}: a sample is {IMU_SPIKE}; all such are rejected")
         if taken.late is not None:
             self._keep_imu(taken.late, taken.hole)
         if taken.set_back_s:

@@ -30,8 +30,8 @@ from graphloc.time import NS_PER_S, stamps_of
 _M = TypeVar("_M", bound=Measurement)
 FROZEN = "frozen receiver"
 """How the reason begins for which a fix of one is rejected, offline and online."""
-WHY = f"{FROZEN} or driver: it repeats one position while the vessel moves"
-WHY_VELOCITY = "frozen receiver or driver: it repeats one velocity bit for bit"
+FROZEN_FIX = f"{FROZEN} or driver: it repeats one position while the vessel moves"
+FROZEN_VELOCITY = f"{FROZEN} or driver: it repeats one velocity bit for bit"
 # A stretch of one position; a driver that repeats fixes does so for less (`frontends/_fixes.py`).
 HELD_S, FEWEST = 2.5, 3
 _NOISE_M = 0.5  # how far the fixes of one position may scatter
@@ -241,7 +241,7 @@ def frozen_fixes_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray
     """Return a line on what `frozen_fixes` found."""
     if not bad.any():
         return []
-    return [f"{sensor}: for {stretches(stamps_ns, bad)} {WHY}; {int(bad.sum())} fixes rejected"]
+    return [f"{sensor}: for {stretches(stamps_ns, bad)} {FROZEN_FIX}; {int(bad.sum())} fixes rejected"]
 
 
 def without_frozen_fixes(
@@ -262,10 +262,10 @@ def without_frozen_fixes(
         bad = frozen_velocities(stamps_ns, v_mps)
         hanging = runs(bad & (np.linalg.norm(v_mps, axis=1) > UNDER_WAY_MPS))
         hung = np.vstack([hung, stamps_ns[hanging - [0, 1]]])
-        gone |= {m.seq: WHY_VELOCITY for m, b in zip(velocities, bad, strict=True) if b}
+        gone |= {m.seq: FROZEN_VELOCITY for m, b in zip(velocities, bad, strict=True) if b}
         if bad.any():
             said.append(
-                f"{sensor}: for {stretches(stamps_ns, bad)} {WHY_VELOCITY}; {int(bad.sum())} velocities rejected"
+                f"{sensor}: for {stretches(stamps_ns, bad)} {FROZEN_VELOCITY}; {int(bad.sum())} velocities rejected"
             )
     for sensor, fixes in _by_sensor(recording, GnssPosition, receivers).items():
         stamps_ns, lat_lon = stamps_of(fixes), np.array([m.position[:2] for m in fixes])
@@ -273,7 +273,7 @@ def without_frozen_fixes(
         # One receiver, or its driver, says both.
         meanwhile = np.any((stamps_ns[:, None] >= hung[:, 0]) & (stamps_ns[:, None] <= hung[:, 1]), axis=1)
         bad[1:] |= np.all(lat_lon[1:] == lat_lon[:-1], axis=1) & meanwhile[1:]
-        gone |= {m.seq: WHY for m, b in zip(fixes, bad, strict=True) if b}
+        gone |= {m.seq: FROZEN_FIX for m, b in zip(fixes, bad, strict=True) if b}
         said += frozen_fixes_warning(sensor, stamps_ns, bad)
     if not gone:
         return recording, said

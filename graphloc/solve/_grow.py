@@ -12,7 +12,7 @@ from graphloc.build import Past, Problem, StartPrior, without_imu
 from graphloc.recording import Progress
 from graphloc.solve._marginals import marginals
 from graphloc.solve._passes import cost_as_configured
-from graphloc.solve.bias_walk import KEYS, BiasWanders, KnownBias, known_bias, went_too_far
+from graphloc.solve.bias_walk import WALK_KEYS, BiasWanders, KnownBias, known_bias, went_too_far
 from graphloc.solve.decide import PredictedCovariance, Stage, Verdicts, agrees, decisions, predicted_by, weigh
 from graphloc.solve.stretch import (
     StretchStep,
@@ -118,7 +118,7 @@ def _wanders(
     except np.linalg.LinAlgError:  # some data do not determine them
         return None
     found = [w for n, now in enumerate(known) if (w := went_too_far(known[:n], now, problem.links)) is not None]
-    return BiasWanders({KEYS[k]: times for k, times in found[-1:]}) if found else None
+    return BiasWanders({WALK_KEYS[k]: times for k, times in found[-1:]}) if found else None
 
 
 def _solve_grown(window: GrownWindow) -> tuple[int, StretchStep, Verdicts]:

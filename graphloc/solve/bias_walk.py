@@ -26,7 +26,7 @@ from graphloc.time import NS_PER_S
 
 WANDERS_S = 60.0
 """Time over which it is looked at how far a bias has gone."""
-KEYS = ("accel_bias_instability_ug", "gyro_bias_instability_deg_per_h")
+WALK_KEYS = ("accel_bias_instability_ug", "gyro_bias_instability_deg_per_h")
 """What is configured of accelerometers and gyroscopes."""
 # Sigmas of its random walk over that, from which variance components are asked whether it needs more walk (`_UNLIKELY`): smoothed, a
 # bias that walks so moves by less than two. A warning alone, where the walk is not to be raised, has no such test and a higher bound.
@@ -156,13 +156,13 @@ def with_needed_walk(problem: Problem, values: gtsam.Values, verdicts: Verdicts,
         needed, _ = components((rows.J, root, rows.b), parts, found, np.zeros(2, dtype=bool), high, [MOST_TIMES] * 2)
     except RuntimeError:  # not determined by normal equations; the solution stands
         return None
-    times = {key: float(t) for key, t in zip(KEYS, needed, strict=True) if t > _LEAST_TIMES}
+    times = {key: float(t) for key, t in zip(WALK_KEYS, needed, strict=True) if t > _LEAST_TIMES}
     return with_imu_scaled(problem, times) if times else None
 
 
 def walk_times(stated: Any, taken: Any) -> dict[str, float]:
     """Return by what factors the walk of the biases is larger in one configuration of an IMU than in another, by key; without those of 1."""
-    every = {key: getattr(taken, key) / getattr(stated, key) for key in KEYS}
+    every = {key: getattr(taken, key) / getattr(stated, key) for key in WALK_KEYS}
     return {key: times for key, times in every.items() if times > 1.0}
 
 

@@ -20,7 +20,7 @@ from graphloc.solution import CONTRADICTING_COST, Graded, SolveStats
 from graphloc.solve._lasting import lasting
 from graphloc.solve._passes import expected_cost
 from graphloc.solve.batch import BatchResult
-from graphloc.solve.bias_walk import KEYS, WANDERS_S, too_steady, walk_times, wandered
+from graphloc.solve.bias_walk import WALK_KEYS, WANDERS_S, too_steady, walk_times, wandered
 from graphloc.solve.decide import AGREES, Verdict
 from graphloc.solve.health import FAR_OFF, late_of
 from graphloc.solve.imu_mount import MountError, mount_sigma_rad
@@ -250,7 +250,7 @@ def _wandering_biases(problem: Problem, result: BatchResult) -> list[str]:
         return []
     every = wandered(problem, result.values)
     for times, what, key, bounds in zip(
-        every, ("accelerometers", "gyroscopes"), KEYS, ("roll, pitch and position", "the heading"), strict=True
+        every, ("accelerometers", "gyroscopes"), WALK_KEYS, ("roll, pitch and position", "the heading"), strict=True
     ):
         if times > _WANDERS_SAID:
             said = f"{problem.imu.sensor}: a bias of its {what} changes within {WANDERS_S:.0f} s by {times:.1f} sigmas of what {key} allows"
