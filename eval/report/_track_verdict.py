@@ -39,20 +39,17 @@ _ALIKE = 0.1
 _WORSE = 1.05  # times a filter's error, from which on ours is said to be larger
 
 
-class Trust(enum.StrEnum):
-    """Level of trust; its value is the colour in the report."""
+class Trust(enum.IntEnum):
+    """Level of trust, the highest first."""
 
-    YES = "#009E73"
-    WITH_CARE = "#E69F00"
-    NO = "#D55E00"
+    YES = 0
+    WITH_CARE = 1
+    NO = 2
 
     @property
     def said(self) -> str:
         """The level in words."""
         return {Trust.YES: "can be trusted", Trust.WITH_CARE: "use with care", Trust.NO: "do not rely on it"}[self]
-
-
-_ORDER = (Trust.YES, Trust.WITH_CARE, Trust.NO)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,7 +81,7 @@ class TrackVerdict:
 
 def worst(of: Iterator[Trust]) -> Trust:
     """Return the lowest of some levels of trust."""
-    return max(of, key=_ORDER.index, default=Trust.YES)
+    return max(of, default=Trust.YES)
 
 
 def track_verdict(data: ReportData, solution: Solution) -> TrackVerdict:
