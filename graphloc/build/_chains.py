@@ -38,6 +38,7 @@ _SILENT = 3.0  # times the usual time between measurements
 _SPACED_OVER_S = 4.0  # longer than gateways hold messages back
 SPACED_BY = 40
 """Measurements up to one, at most, from which it is taken how far apart they come: of the fastest that are used two seconds."""
+_IN_BOUNDS = 1.5  # sigmas of a slow error that the bounds include: jumps up to there need no word
 _CHAIN_END = 2.0  # variances of the process: the prior at either end of a chain
 
 
@@ -263,3 +264,12 @@ def _prior(key: int, sigmas: Array, tails: float | None = None) -> Any:
 
 def _with_tails(model: Any, scale: float) -> Any:
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(scale), model)
+
+
+def allowed_jump_m(slow: SlowProcess | None) -> float:
+    """Return the size (m) up to which the bounds include a jump.
+
+    Args:
+        slow: the slow error (east, north, ...) of a receiver, estimated or added to the bounds; None: it has none.
+    """
+    return 0.0 if slow is None else float(_IN_BOUNDS * slow.sigma[:2].max())

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from graphloc import gauss
+from graphloc.build import allowed_jump_m
 from graphloc.frames import Array
 from graphloc.graph import TIME_OFFSET, Attachment, Residual, antenna_off_m, corrections
 from graphloc.measurements import Measurement
@@ -20,7 +21,6 @@ from graphloc.online._states import States
 from graphloc.signals.frozen_receiver import FROZEN, FROZEN_VELOCITY
 from graphloc.signals.position_jumps import (
     OffPrediction,
-    allowed_jump_m,
     jump_warnings,
     largest_sigma,
     only_position_sensor,

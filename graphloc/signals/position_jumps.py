@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.graph import SlowProcess
 from graphloc.time import NS_PER_S, utc_text
 
 LASTS_S = 200.0
@@ -28,7 +27,6 @@ _JUMP_M, _JUMP, _FEWEST = 3.0, 10.0, 10
 _AROUND = 0.75  # share of the local median, which is usually above that of the whole run
 _SIGMAS, _BRAKES_MPS2 = 10.0, 10.0  # stated sigmas; emergency braking of a car to a stop
 _EVEN = 1.5  # steps in time that differ by more than this factor are not compared
-_IN_BOUNDS = 1.5  # sigmas of the slow error that the bounds include: jumps up to there need no word
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
 # Off a track: fixes on either side of a jump are compared for so long, and at least so many, of which as many lie on their side, as two
 # outliers in a row are no jump (of fixes that are farther apart than that two, as the track follows after these); by how many sigmas of
@@ -68,7 +66,7 @@ def position_jumps(
 
     Args:
         stamps_ns: (N,), increasing. places_m: (N, 2), in a local level frame. sigma_m: (N,) as stated.
-        allowed_m: jumps that the bounds already include (`allowed_jump_m`).
+        allowed_m: jumps that the bounds already include (`build.allowed_jump_m`).
     """
     if len(stamps_ns) < _FEWEST:
         return np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -104,7 +102,7 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
 
     Args:
         stamps_ns: (N,), increasing. off_m: (N, 2) fixes less the track.
-        allowed_m: jumps that the bounds already include (`allowed_jump_m`).
+        allowed_m: jumps that the bounds already include (`build.allowed_jump_m`).
     """
     dt_s = np.diff(stamps_ns) / NS_PER_S
     usual_s = float(np.median(dt_s)) if len(dt_s) else np.inf
@@ -135,15 +133,6 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
         left_m[max(found[-1] - n + 1, 0) : found[-1] + n] = 0.0
     at = np.sort(np.array(found, dtype=np.int64))
     return stamps_ns[at + n], size_m[at]
-
-
-def allowed_jump_m(slow: SlowProcess | None) -> float:
-    """Return the size (m) up to which the bounds include a jump.
-
-    Args:
-        slow: the slow error (east, north, ...) of a receiver, estimated or added to the bounds; None: it has none.
-    """
-    return 0.0 if slow is None else float(_IN_BOUNDS * slow.sigma[:2].max())
 
 
 def _parts(steps_m: Array) -> Array:
