@@ -24,7 +24,7 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, GnssVelocity, Measurement, world_from_fixes
 from graphloc.recording import Recording
 from graphloc.signals.frozen_imu import stretches
-from graphloc.signals.series import runs
+from graphloc.signals.series import line_fit, runs
 from graphloc.time import NS_PER_S, stamps_of
 
 _M = TypeVar("_M", bound=Measurement)
@@ -210,11 +210,9 @@ def _before(t_s: Array, first: int) -> NDArray[np.int64]:
 
 def speed_of(t_s: Array, places_m: Array) -> tuple[float, float]:
     """Return the speed (m/s) of a straight line through places (N, 2), m, at times (N,), s, and its sigma from the residuals."""
-    dt = t_s - t_s.mean()
-    square = max(float(dt @ dt), 1e-9)
-    v = dt @ (places_m - places_m.mean(axis=0)) / square
-    left = places_m - places_m.mean(axis=0) - np.outer(dt, v)
-    return float(np.linalg.norm(v)), float(np.sqrt((left**2).sum() / max(2 * len(t_s) - 4, 1) / square))
+    line = line_fit(t_s, places_m)
+    scatter_m = float(np.sqrt((line.left**2).sum() / max(2 * len(t_s) - 4, 1)))
+    return float(np.linalg.norm(line.slope)), scatter_m * line.sigma
 
 
 def frozen_velocities(stamps_ns: NDArray[np.int64], v_mps: Array) -> NDArray[np.bool_]:
