@@ -39,6 +39,7 @@ from graphloc.frames import Array
 from graphloc.graph import Going
 from graphloc.measurements import ImuSeries
 from graphloc.signals.series import integral, interpolated
+from graphloc.time import duration_ns
 
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # white noise of unknown motion in a gap
 _SHORT_S = 2.0  # longest gap that is interpolated linearly
@@ -60,7 +61,7 @@ class Links:
         self._samples = np.hstack([imu.accel_mps2, imu.gyro_radps])
         self._config = config
         self._R_body_imu = R_body_imu
-        self._max_gap_ns = int(config.max_gap_s * 1e9)
+        self._max_gap_ns = duration_ns(config.max_gap_s)
         self._noise_scale = noise_scale
         self._gravity_mps2 = gravity_mps2 if config.gravity != "removed" else 0.0
         gyro = config.gyro_noise_radps * noise_scale
@@ -90,7 +91,7 @@ class Links:
     def forget(self, before_ns: int) -> None:
         """Drop the samples before a stamp except the last of them, and those that tell how a gap goes on."""
         self._left_out = [gap for gap in self._left_out if gap[1] >= before_ns]
-        before_ns = min([before_ns, *(a - int(_AROUND_S * 1e9) for a, _ in self._left_out)])
+        before_ns = min([before_ns, *(a - duration_ns(_AROUND_S) for a, _ in self._left_out)])
         first = max(int(np.searchsorted(self._stamps, before_ns)) - 1, 0)
         self._stamps, self._samples = self._stamps[first:].copy(), self._samples[first:].copy()
 
@@ -226,7 +227,7 @@ class Links:
 
     def _means_around(self, start_ns: int, stop_ns: int) -> tuple[Array, Array]:
         """Return the means (6,) of the seconds before and after a gap; a side with too few samples takes the mean of the other."""
-        around_ns = int(_AROUND_S * 1e9)
+        around_ns = duration_ns(_AROUND_S)
         first, start, stop, last = np.searchsorted(
             self._stamps, [start_ns - around_ns, start_ns + 1, stop_ns, stop_ns + around_ns]
         )

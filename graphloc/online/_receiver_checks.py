@@ -25,7 +25,7 @@ from graphloc.signals.position_jumps import (
     largest_sigma,
     only_position_sensor,
 )
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, duration_ns
 
 _FITS = 3.0  # sigmas of a fix alone
 FROZEN_ONLINE = f"{FROZEN}: it repeats one position while the vessel moves"
@@ -92,7 +92,7 @@ class ReceiverChecks:
         detector.note(at_s, told_m, estimated_m, sigma_m, newest.velocity[:2], largest_sigma(newest.velocity_cov))
         if detector.frozen and not before:
             since_s = min(at_s - WINDOW_S, detector.stands_s)
-            self._reject_since(stream, m.stamp_ns - int((at_s - since_s) * NS_PER_S), m.stamp_ns)
+            self._reject_since(stream, m.stamp_ns - duration_ns(at_s - since_s), m.stamp_ns)
         if detector.for_long(at_s):
             self._agreement.note(stream, m, None)
         return detector.frozen

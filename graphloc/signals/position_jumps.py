@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.time import NS_PER_S, utc_text
+from graphloc.time import NS_PER_S, duration_ns, utc_text
 
 LASTS_S = 200.0
 """For so long (s) before and after a jump either side may be the wrong one: about as long as a slow error lasts."""
@@ -300,7 +300,7 @@ class JumpDetector:
         stamps_ns, sigmas_m = np.array([at for at, _, _ in self._seen]), np.array([s for _, _, s in self._seen])
         places_m = np.array([p for _, p, _ in self._seen])
         at_ns, _ = position_jumps(stamps_ns, places_m, sigmas_m, allowed_m=allowed_m)
-        until_ns = min(stamps_ns[-3], stamp_ns - int(_BURST_S * NS_PER_S))  # a later one may yet be a burst
+        until_ns = min(stamps_ns[-3], stamp_ns - duration_ns(_BURST_S))  # a later one may yet be a burst
         new = (at_ns > self._judged_ns) & (at_ns <= until_ns)
         self._judged_ns = max(int(until_ns), self._judged_ns)
         known_ns = [jump.after_ns for jump in self.jumps]

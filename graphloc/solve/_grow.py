@@ -24,6 +24,7 @@ from graphloc.solve.stretch import (
     update_states,
 )
 from graphloc.solve.wrong_imu import GrownWindow, ImuWrong, wrong_span
+from graphloc.time import duration_ns
 
 _CHUNK_S, _OVERLAP_S = 15.0, 5.0
 _SETTLED_M = 0.5  # coarse, to save rounds: passes over the whole run follow, which end at `_passes.SETTLED_M`; a choice
@@ -67,8 +68,8 @@ def grow(
         problem, step, verdicts, more = found
         iterations += more
     while known < end:
-        until = int(min(np.searchsorted(stamps, stamps[known] + int(chunk_s * 1e9)), end))
-        back = problem.timeline.floor(int(stamps[known]) - int(overlap_s * 1e9))
+        until = int(min(np.searchsorted(stamps, stamps[known] + duration_ns(chunk_s)), end))
+        back = problem.timeline.floor(int(stamps[known]) - duration_ns(overlap_s))
         start_of_window = int(np.searchsorted(slow_of, slow_of[back]))
         if start_of_window > first and slow_of[start_of_window] < slow_of[known]:
             prior = past_at(problem, step, start_of_window)

@@ -20,6 +20,7 @@ from graphloc.solution import CONTRADICTING_COST, LOST_BOUND_M, Cause, Health, H
 from graphloc.solve.batch import BatchResult
 from graphloc.solve.decide import AGREES, CREDIBLE, Verdict, far_sigmas
 from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE
+from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory, bounds_95
 
 _LOST_HEADING_DEG = 45.0  # 95 % bound beyond which a heading helps nobody
@@ -140,7 +141,7 @@ def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:
     known = np.flatnonzero(np.isfinite(since))
     if not len(known):
         return since
-    first = stamps_ns[known[0]] - int(since[known[0]] * 1e9)
+    first = stamps_ns[known[0]] - duration_ns(since[known[0]])
     return np.where(np.isfinite(since), since, (first - stamps_ns) * 1e-9)
 
 

@@ -24,7 +24,7 @@ from graphloc.recording import Recording
 from graphloc.solve._passes import cost_as_configured
 from graphloc.solve.decide import agrees, met
 from graphloc.solve.stretch import copy_states, dead_reckon
-from graphloc.time import NS_PER_S, utc_text
+from graphloc.time import NS_PER_S, duration_ns, utc_text
 
 WRONG_IMU = "contradicts the other sensors, which agree with each other"
 # Squares of an IMU factor that make it one; and how many times those of the window before.
@@ -99,7 +99,7 @@ def wrong_span(window: GrownWindow, before: gtsam.Values, solve: Callable[[Probl
         before: its states up to `known`, as solved without what is new. solve: solves the window of a problem, in place.
     """
     problem, values, first, known, last, _ = window
-    begin = max(first + 1, problem.timeline.floor(int(problem.timeline.stamps_ns[known] - _BEFORE_S * NS_PER_S)))
+    begin = max(first + 1, problem.timeline.floor(int(problem.timeline.stamps_ns[known]) - duration_ns(_BEFORE_S)))
     agreed, squares = _agreeing(problem, values, begin, last)
     if not _contradicted(problem, values, first, begin, last) and sum(map(_denies, agreed)) < _SENSORS:
         return None
