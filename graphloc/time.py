@@ -18,7 +18,7 @@ class _Stamped(Protocol):
 
 NS_PER_S = 1_000_000_000
 GPS_AHEAD_S = 18.0
-"""GPS time is ahead of UTC by, since 2017."""
+"""Seconds by which GPS time is ahead of UTC since 2017: the leap seconds since 1980."""
 
 
 def seconds_between(start_ns: int, stop_ns: int) -> float:
