@@ -20,7 +20,7 @@ which preserves the bias and a steady turn. The specific force is treated likewi
 average it supports the vessel. (w_m - b_g) x v replaces the mean, v: velocity in body axes when the gap began, so the vessel
 continues in the direction of its bow. Integrated with gravity, an unknown roll would become an acceleration (250 m after 13 s),
 but vessels stay upright: over a gap, roll and pitch wander no more than in one second. Bias and velocity are the values known
-when a link is made (`graphloc.graph.Going`) and are not estimated by it: preintegration needs its samples before the velocity
+when a link is made (`graphloc.inertial.GapMotion`) and are not estimated by it: preintegration needs its samples before the velocity
 is known.
 """
 
@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from graphloc import keys
 from graphloc.config import ImuConfig
 from graphloc.frames import Array
-from graphloc.graph import Going
+from graphloc.inertial import GapMotion
 from graphloc.measurements import ImuSeries
 from graphloc.signals.series import integral, interpolated
 from graphloc.time import duration_ns
@@ -52,7 +52,7 @@ _INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz)-like floor that keeps position covaria
 
 
 class Links:
-    """Preintegration of one IMU (see `graphloc.graph.InertialLink`)."""
+    """Preintegration of one IMU (see `graphloc.inertial.InertialLink`)."""
 
     def __init__(
         self, imu: ImuSeries, config: ImuConfig, R_body_imu: Array, gravity_mps2: float, noise_scale: float
@@ -105,7 +105,7 @@ class Links:
         params.setBodyPSensor(gtsam.Pose3(gtsam.Rot3(self._R_body_imu), np.zeros(3)))
         return params
 
-    def integrate(self, start_ns: int, stop_ns: int, bias: Any, going: Going | None = None) -> Any:
+    def integrate(self, start_ns: int, stop_ns: int, bias: Any, going: GapMotion | None = None) -> Any:
         """Return the preintegrated measurement over [start_ns, stop_ns], in at least two steps.
 
         Args:
@@ -127,7 +127,7 @@ class Links:
         if gap is not None and gap[1] - gap[0] <= _SHORT_S * 1e9 and gap[1] <= self._stamps[-1]:
             params = self._make_params(self._gravity_mps2, _UNKNOWN_MPS2, np.full(3, _UNKNOWN_RADPS))
         elif gap is not None:
-            going = going or Going(bias, np.zeros(3))
+            going = going or GapMotion(bias, np.zeros(3))
             samples, bias = self._bridge(middles, samples, gap, going), going.bias
             params = self._gap_params(start_ns, stop_ns, gap)
         for pause in self._pauses:
@@ -172,7 +172,7 @@ class Links:
         before_ns = min(int(self._stamps[max(left - 1, 0)]), after_ns)
         return before_ns, int(self._stamps[right]) if right < len(self._stamps) else until_ns
 
-    def _bridge(self, stamps_ns: NDArray[np.int64], samples: Array, gap: tuple[int, int], going: Going) -> Array:
+    def _bridge(self, stamps_ns: NDArray[np.int64], samples: Array, gap: tuple[int, int], going: GapMotion) -> Array:
         """Return samples (M, 6) for an interval with a gap, to be integrated without gravity."""
         start_ns, stop_ns = gap
         mean_before, mean_after = self._means_around(start_ns, stop_ns)
@@ -207,7 +207,7 @@ class Links:
         tilt = np.hypot(white, _UNKNOWN_RADPS * np.sqrt(share / ((stop_ns - start_ns) * 1e-9)))
         return self._make_params(0.0, _UNKNOWN_MPS2, np.array([tilt, tilt, _UNKNOWN_RADPS]))
 
-    def _paused(self, params: Any, pause: tuple[int, int], share: float, going: Going | None) -> Any:
+    def _paused(self, params: Any, pause: tuple[int, int], share: float, going: GapMotion | None) -> Any:
         """Return the parameters of an interval, a share of which lies in a pause: it may be that no time passed, and nothing moved.
 
         Over the whole of a pause g that is worth v g, w g and (f - f_m) g, 1 sigma; f_m: the mean force around it, as that is gravity.

@@ -3,7 +3,8 @@
 
 A row turns a measurement into residuals (to weigh it, choose its mode, write its ledger row, and make its factor of) and,
 where they serve better, into native GTSAM factors. Both functions are pure; what a row returns enters the graph whole or not
-at all. Builder and solvers know rows only through this module, never by name.
+at all. Builder and solvers know rows only through this module, never by name. The inertial sensor links states instead of measuring
+one: `graphloc.inertial`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from graphloc import gauss
 from graphloc.berths import Berth
 from graphloc.config import KernelConfig, SensorConfig
 from graphloc.frames import Array, Datum
-from graphloc.measurements import ImuSeries, Measurement
+from graphloc.measurements import Measurement
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -455,106 +456,3 @@ class Sensor:
     def of(self, config: SensorConfig) -> Sensor:
         """Return the row as it holds for a configuration: poses that give only height or heading are neither `absolute` nor `company`."""
         return self if config.tells_place else replace(self, absolute=False, company=False)
-
-
-class InertialRow(Protocol):
-    """Row of the inertial sensor in the table of sensors: it links two states instead of measuring one."""
-
-    kind: str
-
-    @property
-    def config(self) -> type[SensorConfig]:
-        """The class of its configuration."""
-        ...
-
-    def link(
-        self, imu: ImuSeries, config: Any, R_body_imu: Array, gravity_mps2: float, noise_scale: float = 1.0
-    ) -> InertialLink:
-        """Return what preintegrates one IMU.
-
-        Args:
-            imu: its samples. R_body_imu: (3, 3) mount in body. gravity_mps2: size of gravity at the datum.
-            noise_scale: factor on the configured noise densities and on the walk of the biases.
-        """
-        ...
-
-
-class Going(NamedTuple):
-    """What is taken to go on in a gap of the IMU's data, from the state before it.
-
-    Attributes:
-        bias: of the IMU (gtsam.imuBias.ConstantBias). v_body_mps: (3,) velocity, body axes.
-    """
-
-    bias: Any
-    v_body_mps: Array
-
-    @classmethod
-    def of(cls, state: Any, bias: Any) -> Going:
-        """Return what goes on from a state (gtsam.NavState)."""
-        return cls(bias, np.asarray(state.attitude().unrotate(state.velocity())))
-
-
-class InertialLink(Protocol):
-    """Preintegration of one IMU between any two stamps."""
-
-    def integrate(self, start_ns: int, stop_ns: int, bias: Any, going: Going | None = None) -> Any:
-        """Return the preintegrated measurement from `start_ns` to `stop_ns` (start < stop).
-
-        Args:
-            bias: about which the preintegration is linearised, where there are data.
-            going: what goes on in a gap of the data, and the bias to linearise about there; None: `bias`, and a vessel at rest.
-        """
-        ...
-
-    def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
-        """Add samples (N, 6), in any order of time: specific force, m/s^2, and angular rate, rad/s, in IMU axes."""
-        ...
-
-    def leave_out(self, after_ns: int, until_ns: int) -> None:
-        """Drop the samples after one stamp until another, which is then a gap, however short; no sample in it is added later."""
-        ...
-
-    def pause(self, after_ns: int, until_ns: int) -> None:
-        """Add noise between two samples, however near in time: a clock may have been set, so that less time or none has passed."""
-        ...
-
-    def forget(self, before_ns: int) -> None:
-        """Drop the samples before a stamp except the last of them, and what the bridge of a gap after it needs."""
-        ...
-
-    def factor(self, k: int, j: int, preintegrated: Any) -> Any:
-        """Return the factor between states `k` and `k + 1`, with the bias of slow node `j`."""
-        ...
-
-    def gyro_at(self, stamps_ns: NDArray[np.int64]) -> Array:
-        """Return the raw angular rates (M, 3) in body axes at M stamps."""
-        ...
-
-    def gyro_variance_at(self, stamps_ns: NDArray[np.int64]) -> Array:
-        """Return the variance (M,), rad^2/s^2, of each axis of the rates that `gyro_at` returns, without that of the bias."""
-        ...
-
-    def felt_at(self, stamps_ns: NDArray[np.int64]) -> Array:
-        """Return specific force, m/s^2, and angular acceleration, rad/s^2 (M, 6), about M stamps, body axes, biases included.
-
-        They are means over a time that is longer than a hull's vibrations, and shorter than waves.
-        """
-        ...
-
-    @property
-    def gravity_mps2(self) -> Array:
-        """Gravity (3,), world axes: added to a specific force it gives an acceleration. Zero where the driver has removed gravity."""
-        ...
-
-    def bias_steps(self, dt_s: float) -> Array:
-        """Return the sigmas (6,) of the bias random walk over `dt_s`, accelerometer first."""
-        ...
-
-    def bias_sigmas(self) -> Array:
-        """Return the sigmas (6,) of the biases at switching on, accelerometer first."""
-        ...
-
-    def gaps(self) -> list[tuple[int, int]]:
-        """Return the gaps in the data as (start, stop), stamps in ns."""
-        ...

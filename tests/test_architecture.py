@@ -14,19 +14,21 @@ VOCABULARY = {
     "errors", "time", "chi2", "gauss", "frames", "measurements", "ledger", "trajectory", "config", "recording", "offsets", "solution", "estimate", "plain", "blocks", "signals", "survey", "berths", "extras", "folders", "_config_docs",
 }  # fmt: skip
 DOOR = {"__main__", "app", "cli", "drills", "found_tags", "gather", "replay", "stream", "job", "sweep", "ablations"}
-GRAPH = {"graph", "linear", "motion_model", "keys", "timeline", "build", "solve", "online", "origin", "outputs"}
+GRAPH = {
+    "graph", "inertial", "linear", "motion_model", "keys", "timeline", "build", "solve", "online", "origin", "outputs",
+}  # fmt: skip
 FORBIDDEN = {
     "facade": set[str](),  # graphloc/__init__.py imports its public names when they are first used
     "vocabulary": {"factors", "frontends", "eval", "gtsam"} | GRAPH | DOOR,
     "graph": {"factors", "frontends", "eval"} | DOOR,
-    "factors": {"frontends", "eval"} | GRAPH - {"graph", "linear", "keys"} | DOOR,
+    "factors": {"frontends", "eval"} | GRAPH - {"graph", "inertial", "linear", "keys"} | DOOR,
     "frontends": {"factors", "eval", "gtsam"} | GRAPH | DOOR,
     "eval": DOOR,
     "door": set[str](),
 }
 # The online mode judges and starts as `solve` does; nothing below knows it, and building knows no solver.
 ABOVE = {
-    **{name: {"build", "solve", "online"} for name in ("graph", "linear", "keys", "timeline", "motion_model")},
+    **{name: {"build", "solve", "online"} for name in ("graph", "inertial", "linear", "keys", "timeline", "motion_model")},
     "origin": {"solve", "online"}, "build": {"solve", "online"}, "solve": {"online"}, "outputs": {"build", "solve", "online"},
 }  # fmt: skip
 

@@ -13,7 +13,8 @@ from graphloc import keys
 from graphloc.build._chains import walk_between_nodes
 from graphloc.config import VesselConfig
 from graphloc.frames import Array, Datum
-from graphloc.graph import TIME_OFFSET, Attachment, Constant, FeltMotion, InertialLink, Sensor, SlowProcess
+from graphloc.graph import TIME_OFFSET, Attachment, Constant, FeltMotion, Sensor, SlowProcess
+from graphloc.inertial import InertialLink
 from graphloc.measurements import NO_HEIGHT_M2, Measurement
 
 _NO_HEIGHT_M2 = np.array([0.0, 0.0, NO_HEIGHT_M2])  # adds to a fix what leaves its height without weight

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from graphloc import keys
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
-from graphloc.graph import CONSTANT_TAILS, InertialLink, SlowProcess
+from graphloc.graph import CONSTANT_TAILS, SlowProcess
+from graphloc.inertial import InertialLink
 from graphloc.time import NS_PER_S, duration_ns
 
 # Loss of a step: beyond this many sigmas it counts as a jump.

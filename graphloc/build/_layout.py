@@ -19,7 +19,8 @@ from graphloc.build._usable import silent_sensors, sorted_out, usable_imu
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
-from graphloc.graph import PLACE, Constant, InertialLink, InertialRow, Sensor, SlowProcess
+from graphloc.graph import PLACE, Constant, Sensor, SlowProcess
+from graphloc.inertial import InertialLink, InertialRow
 from graphloc.measurements import Measurement
 from graphloc.recording import Mounts, Recording
 from graphloc.signals.pauses import common_pauses, pauses_warning

@@ -20,7 +20,8 @@ from graphloc.build._attach import Carry, asks_for_delay, nav_state
 from graphloc.build._usual_motion import UsualMotion, usual_motion
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.frames import Array, Datum
-from graphloc.graph import Constant, Going, InertialLink, Sensor, SlowProcess
+from graphloc.graph import Constant, Sensor, SlowProcess
+from graphloc.inertial import GapMotion, InertialLink
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.time import NS_PER_S, stamps_of
@@ -246,7 +247,7 @@ def _bridged(problem: Problem, values: gtsam.Values, gaps: Sequence[tuple[int, i
     for start_ns, stop_ns in gaps:
         first = timeline.floor(start_ns)
         bias = values.atConstantBias(keys.bias(int(timeline.slow_of[first])))
-        going = Going.of(nav_state(values, first), bias)
+        going = GapMotion.of(nav_state(values, first), bias)
         for k in range(first, min(timeline.floor(stop_ns - 1) + 1, len(timeline) - 1)):
             a, b = (int(stamp) for stamp in timeline.stamps_ns[k : k + 2])
             preintegrated[k] = problem.links.integrate(a, b, zero, going)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtr, chdtri
 
-from graphloc.graph import InertialLink
+from graphloc.inertial import InertialLink
 from graphloc.measurements import ImuSeries
 from graphloc.online._lag import Lag
 from graphloc.solve.bias_walk import MOST_TIMES, WALK_KEYS, KnownBias, too_steady, went_too_far

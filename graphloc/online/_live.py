@@ -31,7 +31,8 @@ from graphloc.build import (
 )
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
-from graphloc.graph import Constant, InertialLink, Sensor, SlowProcess
+from graphloc.graph import Constant, Sensor, SlowProcess
+from graphloc.inertial import InertialLink
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.motion_model import MotionModel
 from graphloc.online._frozen_receiver import FrozenReceiverDetector

@@ -19,7 +19,8 @@ from graphloc.config import VesselConfig
 from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate, Event
 from graphloc.frames import Array, Datum
-from graphloc.graph import InertialRow, Sensor
+from graphloc.graph import Sensor
+from graphloc.inertial import InertialRow
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement
 from graphloc.online._intake import ImuIntake, series_of

@@ -28,7 +28,8 @@ import numpy as np
 
 from graphloc import keys
 from graphloc.frames import Array, skew
-from graphloc.graph import Going, InertialLink, SlowProcess
+from graphloc.graph import SlowProcess
+from graphloc.inertial import GapMotion, InertialLink
 from graphloc.motion_model import MotionModel
 from graphloc.online._anchor import in_world, sound
 from graphloc.online._live import LiveProblem, LiveStream
@@ -239,7 +240,9 @@ def _by_motion_model(
 def _step(before: Newest, newest: Newest, links: InertialLink) -> tuple[Array, Array]:
     """Return F and Q (15, 15), in axes of world, from one state to the next, by the IMU."""
     start = gtsam.NavState(before.pose, before.velocity)
-    pim = links.integrate(before.stamp_ns, newest.stamp_ns, gtsam.imuBias.ConstantBias(), Going.of(start, before.bias))
+    pim = links.integrate(
+        before.stamp_ns, newest.stamp_ns, gtsam.imuBias.ConstantBias(), GapMotion.of(start, before.bias)
+    )
     there, values = pim.predict(start, before.bias), gtsam.Values()
     for k, state in enumerate((start, there)):
         values.insert(keys.pose(k), state.pose())

@@ -18,7 +18,7 @@ from scipy.special import chdtrc
 from graphloc import keys
 from graphloc.build import Past, Problem, StartPrior, with_imu_scaled
 from graphloc.frames import Array
-from graphloc.graph import InertialLink
+from graphloc.inertial import InertialLink
 from graphloc.solve.decide import Verdicts
 from graphloc.solve.imu_noise import components, squares_and_freedom
 from graphloc.solve.linearised import linearised, normal_solver
