@@ -44,8 +44,8 @@ from graphloc.time import duration_ns
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # white noise of unknown motion in a gap
 _SHORT_S = 2.0  # longest gap that is interpolated linearly
 _FORGET_S, _AROUND_S = 1.0, 10.0  # decay of the last sample in a gap; length of the means on either side
-_LAID_MPS = 3.0  # of a vessel before its velocity is known
-_ASKEW_RAD = 0.1  # of the direction of what moves across a pause
+_LAID_MPS = 3.0  # 1 sigma, of a vessel whose velocity is not known yet
+_ASKEW_RAD = 0.1  # 1 sigma, of the direction of a motion across a pause
 _GAP_STEP_S = 0.1  # integration step across a gap
 _ABOUT_NS = 100_000_000  # to either side of a stamp: shorter than waves, longer than vibration
 _INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz)-like floor that keeps position covariance positive
@@ -78,18 +78,18 @@ class Links:
         self._stamps, self._samples = stamps, rows
 
     def leave_out(self, after_ns: int, until_ns: int) -> None:
-        """Drop the samples of an interval, of which the first of all is none; however short, it is a gap."""
+        """Drop the samples after one stamp until another, which is then a gap, however short. The very first sample is not among them."""
         kept = (self._stamps <= after_ns) | (self._stamps > until_ns)
         self._stamps, self._samples = self._stamps[kept], self._samples[kept]
         within = [gap for gap in self._left_out if after_ns <= gap[0] and gap[1] <= until_ns]
         self._left_out = [gap for gap in self._left_out if gap not in within] + [(after_ns, until_ns)]
 
     def pause(self, after_ns: int, until_ns: int) -> None:
-        """Allow for no time having passed between two samples: it is a gap then, however short."""
+        """Add noise between two samples, as if less time or none had passed between them; that is then a gap, however short."""
         self._pauses.append((after_ns, until_ns))
 
     def forget(self, before_ns: int) -> None:
-        """Drop the samples before a stamp except the last of them, and those that tell how a gap goes on."""
+        """Drop the samples before a stamp, except the last of them and those that the bridge of a gap after it needs."""
         self._left_out = [gap for gap in self._left_out if gap[1] >= before_ns]
         before_ns = min([before_ns, *(a - duration_ns(_AROUND_S) for a, _ in self._left_out)])
         first = max(int(np.searchsorted(self._stamps, before_ns)) - 1, 0)
@@ -109,7 +109,7 @@ class Links:
         """Return the preintegrated measurement over [start_ns, stop_ns], in at least two steps.
 
         Args:
-            bias: `gtsam.imuBias.ConstantBias`. going: bias and velocity at the begin of a gap.
+            bias: `gtsam.imuBias.ConstantBias`. going: bias and velocity where a gap begins; None: `bias`, and at rest.
         """
         first = int(np.searchsorted(self._stamps, start_ns, side="right"))
         last = int(np.searchsorted(self._stamps, stop_ns, side="left"))
@@ -149,7 +149,7 @@ class Links:
         return np.asarray(self._samples[right - 1] * (1.0 - share) + self._samples[right] * share)
 
     def _gap_of(self, start_ns: int, stop_ns: int) -> tuple[int, int] | None:
-        """Return the longest gap (start, stop) that overlaps an interval, if any; the time after the last sample is one too."""
+        """Return the longest gap (start, stop) that overlaps an interval, or None. The time after the last sample is a gap, too."""
         for after_ns, until_ns in self._left_out:
             if after_ns < stop_ns and start_ns < until_ns:
                 return self._around(after_ns, until_ns)
@@ -167,13 +167,17 @@ class Links:
         return int(stamps[n]), int(stamps[n + 1])
 
     def _around(self, after_ns: int, until_ns: int) -> tuple[int, int]:
-        """Return the samples (stamps) around an interval without any; where none follows it, its end."""
+        """Return the stamps of the samples before and after an interval that has none; where none follows it, its end."""
         left, right = np.searchsorted(self._stamps, [after_ns, until_ns], side="right")
         before_ns = min(int(self._stamps[max(left - 1, 0)]), after_ns)
         return before_ns, int(self._stamps[right]) if right < len(self._stamps) else until_ns
 
     def _bridge(self, stamps_ns: NDArray[np.int64], samples: Array, gap: tuple[int, int], going: GapMotion) -> Array:
-        """Return samples (M, 6) for an interval with a gap, to be integrated without gravity."""
+        """Return samples (M, 6), at stamps (M,), of an interval with a gap, to be integrated without gravity (see the module's docstring).
+
+        Args:
+            samples: (M, 6) those outside the gap. gap: its begin and end, stamps.
+        """
         start_ns, stop_ns = gap
         mean_before, mean_after = self._means_around(start_ns, stop_ns)
         length, t = (stop_ns - start_ns) * 1e-9 / _FORGET_S, (stamps_ns - start_ns)[:, None] * 1e-9 / _FORGET_S
@@ -208,9 +212,10 @@ class Links:
         return self._make_params(0.0, _UNKNOWN_MPS2, np.array([tilt, tilt, _UNKNOWN_RADPS]))
 
     def _paused(self, params: Any, pause: tuple[int, int], share: float, going: GapMotion | None) -> Any:
-        """Return the parameters of an interval, a share of which lies in a pause: it may be that no time passed, and nothing moved.
+        """Return the parameters of an interval, a share of which lies in a pause, in which perhaps no time passed and nothing moved.
 
-        Over the whole of a pause g that is worth v g, w g and (f - f_m) g, 1 sigma; f_m: the mean force around it, as that is gravity.
+        The motion over a whole pause of length g is then wrong by v g, w g and (f - f_m) g, which is taken as 1 sigma; f_m: the mean
+        specific force around the pause, which is mostly gravity.
         """
         moved = _squared(going.v_body_mps) if going else _LAID_MPS**2 * np.eye(3)
         bias = going.bias if going else gtsam.imuBias.ConstantBias()
@@ -316,7 +321,7 @@ class Links:
 
 
 def _squared(v: Array) -> Array:
-    """Return the covariance (3, 3) of what is v (3,) or nothing, whose direction is known to `_ASKEW_RAD` when a link is made."""
+    """Return the covariance (3, 3) of an error that is v (3,) or zero, where the direction of v is known to `_ASKEW_RAD`."""
     return np.asarray(np.outer(v, v) + _ASKEW_RAD**2 * float(v @ v) * np.eye(3))
 
 

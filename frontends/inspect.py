@@ -258,9 +258,11 @@ def _motions(
 
 
 def _imu_reports(bag: Contents, evidence: ImuEvidence) -> list[ImuReport]:
-    """Report the IMUs: whole ones with gravity in them first, of these any that feel how the craft moves, the least noisy ones first; of those about as noisy, one whose mount tf or the motion tells.
+    """Return the reports on the IMUs, the best one first.
 
-    One that feels nothing of what another one feels turns on its own: that of a stabilised camera.
+    In this order: those with rates and accelerations; with gravity in them; that feel how the craft moves (one that does not turns on
+    its own, as in a stabilised camera); that are about as quiet as the quietest of these; whose mount is known by tf; whose yaw is
+    known; the quietest.
     """
     imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, evidence))]
     moved = {imu.topic for imu in imus if len(imus) > 1 and feels_motion(bag.aligned[imu.topic], imu, evidence)}

@@ -319,9 +319,10 @@ class Tracking:
         return sorted(again, key=lambda m: m.stamp_ns)
 
     def told_by(self) -> tuple[list[Measurement], float]:
-        """Return by stamp what the motion has told a heading by, and about what yaw it begins with, by the gyroscope as it is, rad.
+        """Return the data by which the motion has told a heading, by stamp, and about what yaw, rad, the body had at the first of them.
 
-        What has a row, or gets one with the window, is without (seq -1).
+        The gyroscope carries the yaw of the newest state back to there, its bias not removed. Data whose ledger row is written, or will
+        be written with the window, have no arrival number (seq -1).
         """
         lag = self.lag
         since_ns = min(lag.newest.stamp_ns - duration_ns(_TOLD_S), lag.first_ns)

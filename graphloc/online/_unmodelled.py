@@ -87,11 +87,14 @@ class UnmodelledError:
     def at(
         cls, problem: LiveProblem, newest: Newest, P: Array, begun: BeforeStart | None, last: ErrorSizes | None
     ) -> UnmodelledError | None:
-        """Return that of the first state of a window, where the position is off by all of the errors; None where there is nothing of that.
+        """Return the error of a window's first state, whose position is off by the whole of each left-out error.
+
+        None where no error is left out and the IMU's mount is known exactly.
 
         Args:
-            newest, P: that state. begun: what has been done to it before; None: nothing. last: as it was last, taken where it has the
-                size for these streams; None: not known.
+            newest, P: first state, and its covariance without these errors.
+            begun: what the errors did to that state before the window began; None: nothing.
+            last: sizes at the end of the window before, taken over where their shapes fit these streams; None: there are none.
         """
         streams = problem.streams
         left_out = untold_errors(list(streams.values()))
