@@ -3,10 +3,10 @@
 
     z = (p + R l)_up + d^2 / 2 R_earth - t + w,   w ~ N(0, s^2)
 
-p, R: state in world; l: body origin from it; d: horizontal distance from the datum, since the sea falls below its tangent plane
-(2 m at 5 km), taken from the estimate at every pass; t: rise of the vessel by tide and load, and what the fixes' median is off by
-where it stands for the height, a slow state. Modelled as noise, a tide of 0.2 m is contradicted 120 times in two minutes, and
-biases the height that tags on a quay give. Without t: a native `GPSFactorArm` whose horizontal sigmas are 1 km.
+p, R: state in world; l: body origin seen from the state; d: horizontal distance from the datum, taken from the estimate at every
+pass, as the sea falls below the datum's tangent plane (2 m at 5 km); t: a slow state: rise of the vessel by tide and load, and the error
+of the configured height, or of the fixes' median that stands for it. Modelled as noise, a tide of 0.2 m is contradicted 120 times in
+two minutes, and biases the height that tags on a quay give. Without t: a native `GPSFactorArm` whose horizontal sigmas are 1 km.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def ideal(at: Attachment, config: HeightConfig) -> HeightPrior:
 
 
 def slow(config: HeightConfig) -> SlowProcess | None:
-    """Return the rise by tide and load, and what the configured height is off by; None if nothing of that is modelled."""
+    """Return the process of tide, load and the error of the configured height (t); None if it is not modelled."""
     if config.offset_sigma_m == 0.0:
         return None
     return SlowProcess(

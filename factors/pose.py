@@ -4,15 +4,15 @@
 The measured axes replace those of the current estimate of the sensor's pose; the result, moved to the
 body, anchors a native `PriorFactorPose3` whose unmeasured axes are wide:
 
-    Z = T_world_sensor(measured axes), less `carried_m` ;  anchor = Z T_state_sensor^-1 ;  e = Log(anchor^-1 T_world_body)
+    Z = T_world_sensor(measured axes), less `Attachment.carried_m` ;  anchor = Z T_state_sensor^-1 ;  e = Log(anchor^-1 T_world_body)
 
-Exact when re-anchored (measured: anchored level it is 11 % wrong at 3 deg of roll and pitch), which
-the solver does every pass. Rotation errors are small rotations about the world's axes, as in ROS.
+That is exact where the anchor has the roll and pitch of the estimate, so the solver makes the factor anew at every pass (with a level
+anchor it is 11 % wrong at 3 deg of roll and pitch). Rotation errors are small rotations about the world's axes, as in ROS.
 Each mode is a hypothesis, and so is 'none of them'; the solver weighs them. Not handled: pitch near
 +-90 deg where roll and yaw are measured alone.
 
-An error d that poses share for a while (`PoseConfig.slow_error`; first-order Gauss-Markov, in x, y, z and yaw as measured) is added to
-what is predicted, `e = Log(anchor^-1 T_world_body) + d`; the factor then has two states, and is relinearised at every pass
+Poses may share an error d for a while (`PoseConfig.slow_error`: first-order Gauss-Markov, in those of x, y, z and yaw that are measured).
+It is added to the prediction, `e = Log(anchor^-1 T_world_body) + d`; the factor then has two states, and is linearised at every pass
 (`graphloc.linear`).
 """
 
@@ -56,7 +56,7 @@ def _measured_sensor_pose(mode: PoseMode, axes: tuple[str, ...], T_world_sensor:
 
 
 def without_slow(m: PoseFix, config: AnyPoseConfig, at: Attachment) -> tuple[Residual, ...]:
-    """Return predicted - measured (k,), m and rad, for each mode, as if nothing slow were added to what is measured."""
+    """Return predicted - measured (k,), m and rad, for each mode, without a slow state."""
     T_world_sensor = _sensor_pose(at)
     R = T_world_sensor.rotation().matrix()
     picked = [AXES.index(a) for a in m.axes]
@@ -95,10 +95,11 @@ def _size_deg(raw: Array, axes: tuple[str, ...]) -> float | None:
 
 
 def with_slow(plain: Residual, axes: tuple[str, ...], value: Array, shown: Array, by_pose: Array) -> Residual:
-    """Return a residual with what a slow state adds to it.
+    """Return a residual to which a slow state is added.
 
     Args:
-        value: (n,) of the slow state. shown: (k, n) d raw / d (slow state). by_pose: (k, 6) d raw / d (body tangent of the state's pose), with what the slow state does.
+        value: (n,) of the slow state. shown: (k, n) d raw / d (slow state).
+        by_pose: (k, 6) d raw / d (body tangent of the state's pose), slow state included.
     """
     raw = plain.raw + shown @ value
     return replace(
@@ -197,7 +198,7 @@ def _world_jacobian(R_world_sensor: Array, T_state_sensor: Any) -> Array:
 
 
 def ideal_without_slow(at: Attachment, config: AnyPoseConfig) -> PoseFix:
-    """Return the noise-free pose at the attachment's state, as if nothing slow were added to it."""
+    """Return the noise-free pose at the attachment's state, without a slow state."""
     T = _sensor_pose(at)
     values = np.concatenate([T.translation(), T.rotation().rpy()])
     sigmas = np.where(np.arange(6) < 3, 0.3, np.radians(2.0))
@@ -207,7 +208,7 @@ def ideal_without_slow(at: Attachment, config: AnyPoseConfig) -> PoseFix:
 
 
 def moved(ideal: PoseFix, by: Array) -> PoseFix:
-    """Return a pose of one mode, its value (k,) moved by something slow."""
+    """Return a pose of one mode, its value (k,) moved by that of a slow state."""
     (mode,) = ideal.modes
     return replace(ideal, modes=(replace(mode, value=mode.value + by),))
 
@@ -230,7 +231,7 @@ def hint(m: PoseFix, mount_yaw_rad: float, datum: Datum) -> Hint:
 
 
 def scaled(m: PoseFix) -> dict[str, list[int]]:
-    """Return which axes each factor of the configuration scales."""
+    """Return the keys of the configuration that scale sigmas, each with the axes (numbers) that it scales."""
     long = [k for k, axis in enumerate(m.axes) if AXES.index(axis) < 3]
     return {"sigma_scale": long, "angle_sigma_scale": [k for k in range(len(m.axes)) if k not in long]}
 
