@@ -53,9 +53,9 @@ def write_run(
     """Write all files of a run but the report into an existing folder.
 
     Args:
-        folder: where to. solution: what to write. config: its effective form goes along, its mounts in numbers.
+        folder: to write into. solution: what to write. config: written in its effective form, with mounts in numbers.
         inputs: SHA-256 of each input. command: the command line. metrics: tables as plain data.
-        warnings: all that the report shows. span: which part of the bag it is.
+        warnings: all that the report shows. span: the part of the bag that the run is; None: the whole.
     """
     picked = thinned(solution.trajectory.stamps_ns, config.output.rate_hz)
     _csv(folder / "solution.csv", _solution_columns(solution), _solution_rows(solution, picked))
@@ -73,8 +73,9 @@ def write_run(
 
 
 def thinned(stamps: NDArray[np.int64], rate_hz: float) -> Array:
-    """Indices of the states to write: at most `rate_hz` a second, the last one included."""
-    slot = np.rint((stamps - stamps[0]) * 1e-9 * rate_hz).astype(np.int64)  # states move onto stamps, by under half
+    """Return the indices of the states to write: at most `rate_hz` per second, and the last one."""
+    # States move onto stamps of measurements, by under half a period.
+    slot = np.rint((stamps - stamps[0]) * 1e-9 * rate_hz).astype(np.int64)
     picked = np.flatnonzero(np.diff(slot, prepend=-1) > 0)
     return np.unique(np.append(picked, len(stamps) - 1))
 
@@ -242,7 +243,7 @@ _BERTH_COLUMNS = (
 
 
 def _berth_files(solution: Solution) -> dict[str, BerthTrack]:
-    """File names of the berths; what a name cannot have in a file system becomes a dash."""
+    """Return the file names of the berths; characters that a file system may refuse become dashes."""
     files: dict[str, BerthTrack] = {}
     for berth in solution.berths:
         name = re.sub(r"[^\w-]+", "-", berth.berth.name)

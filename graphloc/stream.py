@@ -69,7 +69,7 @@ def as_json(estimate: Estimate, datum: Datum) -> dict[str, object]:
 
 
 class Smoother(Protocol):
-    """What a stream asks of an `OnlineSmoother`, whose docstrings hold."""
+    """The part of an `OnlineSmoother` that a stream uses; docstrings are there."""
 
     @property
     def waiting_for(self) -> str: ...  # noqa: D102
@@ -83,7 +83,7 @@ class Smoother(Protocol):
 
 
 class _Session:
-    """What goes out, and what was counted."""
+    """Writes the lines that go out, and counts ledger rows."""
 
     def __init__(self, out: TextIO, smoother: Smoother, ledger: bool) -> None:
         self._out, self._smoother, self._ledger = out, smoother, ledger
@@ -136,7 +136,7 @@ def run(
 
     Args:
         rate_hz: estimates a second, predicted at stamps of IMU samples; None: one at each new state.
-        ledger: write rows of the ledger as they become final.
+        ledger: whether to write ledger rows as they become final.
     """
     session = _Session(out, smoother, ledger)
     session.news()
