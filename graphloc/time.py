@@ -42,7 +42,7 @@ def duration_ns(duration_s: float) -> int:
 
 
 def seconds_text(stamp_ns: int) -> str:
-    """Return a stamp as seconds since the epoch with all nine decimals, e.g. `1432235857.988949113`."""
+    """Return a stamp as seconds since the epoch with all nine decimals, e.g. `1432235497.988949113`."""
     whole, rest = divmod(stamp_ns, NS_PER_S)
     return f"{whole}.{rest:09d}"
 
