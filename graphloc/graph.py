@@ -232,7 +232,7 @@ class Decision:
 
 
 LATE = "late"
-"""Name of a constant axis of a slow state: the delay (s) of all stamps of a sensor, which `time_offset_s` would correct."""
+"""Name of a constant axis of a slow state: time of measurement less the stamp, s, of a sensor; `time_offset_s` would correct it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -295,9 +295,9 @@ class SlowProcess:
 CONSTANT_TAILS = 9.0
 """Square of a constant's estimate, in squared sigmas of its prior, at which the re-weighted variance of that prior has doubled."""
 TIME_OFFSET = "time_offset_s"
-"""Key of vessel.yaml that the estimated delay of a sensor's stamps corrects."""
+"""Key of vessel.yaml that a sensor's estimated time of measurement less its stamp is added to."""
 PLACE = ("mount.xyz_m[0]", "mount.xyz_m[1]", "mount.xyz_m[2]")
-"""Keys of vessel.yaml that the estimated place of an antenna corrects."""
+"""Keys of vessel.yaml that the estimated place of an antenna, less the configured one, is added to."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
