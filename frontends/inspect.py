@@ -69,7 +69,7 @@ from graphloc.frontends._unused import (
 from graphloc.frontends.decode import FIX_TYPES, IMU, PLAIN_TWIST, POSE_TYPES, TWIST, VECTOR
 from graphloc.frontends.part import Bags
 from graphloc.frontends.source import Bag
-from graphloc.frontends.time_offsets import motion_time_offset
+from graphloc.frontends.time_offsets import motion_time_offsets
 from graphloc.signals.frozen_receiver import frozen_fixes
 from graphloc.signals.white_noise import white_noise
 
@@ -126,7 +126,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     if imus and imus[0] is not taken[0]:
         best = _best_imu(bag, imus, evidence)
     velocities = [(s, with_side(report, s, best.felt if best else None)) for s, report in velocities]
-    late = {motion.source: motion_time_offset(best.felt, motion) for motion in motions} if best else {}
+    late = motion_time_offsets(best.felt, bag.aligned[imus[0].topic], motions, bag.aligned) if best else {}
     timed = [timed_fixes(report, late, motions, velocities, bag.streams) for report in gnss]
     together = {receiver_of(report.topic): report.late_s for report in timed if report.late_s}
     if any(c.late_s is None and receiver_of(c.topic) in together for c in compasses):
