@@ -29,6 +29,7 @@ from graphloc.frontends._sanity import (
 )
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import Pose, StaticTree
+from graphloc.frontends._turns import unit_of_turns
 from graphloc.frontends.turning import Turning, course_against_turning, left_of_turns
 from graphloc.measurements import ImuSeries
 from graphloc.signals.frozen_imu import frozen_imu_warning, frozen_samples
@@ -376,7 +377,10 @@ def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
     stamps = imu.stamps_ns[keep]
     accel, gyro = np.where(finite[:, None], rows[:, :3], 0.0), np.where(finite[:, None], rows[:, 3:6], 0.0)
     missing = missing_half(accel, gyro)
-    units = _units_of(stamps, accel, gyro)
+    units = _units_of(
+        ImuSeries(sensor=imu.topic, stamps_ns=stamps, accel_mps2=accel, gyro_radps=gyro, seqs=np.arange(len(stamps))),
+        evidence.courses,
+    )
     accel = accel * (STANDARD_GRAVITY_MPS2 if units.accel == "g" else 1.0)
     gyro = gyro * (np.pi / 180.0 if units.gyro == "deg/s" else 1.0)
     spiked = spike_warning(imu.topic, stamps, spikes(stamps, np.hstack([accel, gyro])))
@@ -423,13 +427,17 @@ class _Units(NamedTuple):
     why: tuple[str, ...]
 
 
-def _units_of(stamps: NDArray[np.int64], accel: Array, gyro: Array) -> _Units:
-    """Return the likely units of accelerations (N, 3) and rates (N, 3), at stamps (N,) ns."""
+def _units_of(imu: ImuSeries, courses: Courses | None) -> _Units:
+    """Return the likely units of samples as they are told: of rates by how they turn beside the courses; where that is not clear, by their size."""
+    stamps, accel, gyro = imu.stamps_ns, imu.accel_mps2, imu.gyro_radps
     size, at_ease = size_at_ease(accel, gyro)
     rate = float(np.median(np.linalg.norm(gyro, axis=1)))
     gravity = "removed" if without_gravity(accel) else "included"
     accel_unit = "g" if gravity == "included" and 0.9 < size < 1.1 else "m/s^2"
-    gyro_unit = "deg/s" if rate > NEVER_STILL_RADPS and not turns_gravity(stamps, accel, gyro) else "rad/s"
+    si = replace(imu, accel_mps2=accel * (STANDARD_GRAVITY_MPS2 if accel_unit == "g" else 1.0))
+    turns = unit_of_turns(si, (courses.stamps_ns, courses.course_rad)) if courses is not None else None
+    fast = rate > NEVER_STILL_RADPS and not turns_gravity(stamps, accel, gyro)
+    gyro_unit = turns or ("deg/s" if fast else "rad/s")
     why = []
     if accel_unit == "g":
         why.append(f"median acceleration is {size:.2f}: looks like g")
@@ -437,7 +445,9 @@ def _units_of(stamps: NDArray[np.int64], accel: Array, gyro: Array) -> _Units:
         why.append(f"median acceleration is {size:.2f}: looks like gravity was removed by the driver")
     if accel_unit == "m/s^2" and gravity == "included" and no_gravity_in_si(size, at_ease):
         why.append(f"median acceleration is {size:.2f}: neither m/s^2 nor g with gravity; check the sensor")
-    if gyro_unit == "deg/s":
+    if turns == "deg/s":
+        why.append("it turns as the courses of the fixes do in deg/s")
+    elif gyro_unit == "deg/s":
         why.append(f"median rate is {rate:.2f}: too much for rad/s, looks like deg/s")
     return _Units(accel_unit, gyro_unit, gravity, size, tuple(why))
 

@@ -1082,6 +1082,25 @@ def test_two_antennas_athwart_that_are_silent_in_turns_are_a_compass_beside_a_co
     assert "often goes sideways, since it turns as the gyro does" in text
 
 
+@pytest.mark.parametrize("scale", [1.0, 180.0 / np.pi], ids=["rad/s", "deg/s"])
+def test_the_unit_of_a_robot_that_trots_is_told_by_its_turns(scale: float, tmp_path: Path) -> None:
+    """It swings twice a second at 0.5 rad/s, and each step shakes it: deg/s were drafted, and then refused, as it turned 54 times less than the courses."""
+    make, rng = Messages(2), np.random.default_rng(1)
+    items = drive(make, gyro_scale=scale, seconds=120)
+    for topic, at, m in items:
+        if topic == "/imu":
+            phase = 4.0 * np.pi * (at - START_NS) / S
+            m.angular_velocity.x += scale * 0.6 * np.sin(phase)
+            m.angular_velocity.y += scale * 0.6 * np.cos(phase)
+            for axis in "xyz":
+                setattr(m.linear_acceleration, axis, getattr(m.linear_acceleration, axis) + 4.0 * rng.normal())
+    _, config, text = look(tmp_path, items, make)
+    assert isinstance(config.sensors["imu"], ImuConfig)
+    assert config.sensors["imu"].gyro_unit == ("rad/s" if scale == 1.0 else "deg/s")
+    assert ("it turns as the courses of the fixes do in deg/s" in text) == (scale != 1.0)
+    assert not [w for w in read_recording(tmp_path / "run", config).warnings if "looks like deg/s" in w]
+
+
 def stamped_late(make: Messages, late_s: float, *, seconds: int, noise_m: float) -> list[Item]:
     """A drive without wheels, whose fixes are stamped so much later than they were measured."""
     items = [
