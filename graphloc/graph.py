@@ -506,8 +506,8 @@ class InertialLink(Protocol):
         """What is to be added to a specific force (3,), world axes, m/s^2; zero where the driver has done so."""
         ...
 
-    def bias_steps(self, dt_s: float) -> Array:
-        """Return the sigmas (6,) of the bias random walk over `dt_s`, accelerometer first."""
+    def bias_steps(self, from_ns: int, to_ns: int) -> Array:
+        """Return the sigmas (6,) of how far the bias goes from one stamp to another, accelerometer first."""
         ...
 
     def bias_sigmas(self) -> Array:
