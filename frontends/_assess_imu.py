@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from graphloc.config import STANDARD_GRAVITY_MPS2
+from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
 from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, wrap_angle
 from graphloc.frontends import _clock
 from graphloc.frontends._assess import Courses, MeasuredMotion, vec
@@ -24,6 +24,7 @@ from graphloc.frontends._sanity import (
     no_gravity_in_si,
     saturation_warning,
     size_at_ease,
+    slow_warning,
     turns_gravity,
     without_gravity,
 )
@@ -403,7 +404,14 @@ def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
         accel_unit=units.accel,
         gyro_unit=units.gyro,
         gravity=units.gravity,
-        why=(*frozen, *spiked, *cut, *([f"all its {missing} are 0: {HALF}"] if missing else []), *units.why),
+        why=(
+            *frozen,
+            *slow_warning(imu.topic, stamps, ImuConfig()),
+            *spiked,
+            *cut,
+            *([f"all its {missing} are 0: {HALF}"] if missing else []),
+            *units.why,
+        ),
         still_s=float(still.sum()) * root_dt**2,
         gyro_bias_radps=vec(gyro[still].mean(axis=0)) if quiet else None,
         accel_noise_ug=float(white_noise(accel).max()) * root_dt / ug,

@@ -13,6 +13,7 @@ from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum, Geodetic, continuous_longitudes
 from graphloc.measurements import GnssPosition, ImuSeries, PoseFix
+from graphloc.time import NS_PER_S
 
 FAR_M = 100e3
 """A fix this far from the middle of its run is not believed."""
@@ -108,6 +109,15 @@ def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuC
     elif config.gravity == "removed" and g > 8.0:
         lines.append(f"{said}: looks like gravity is included; set gravity: included")
     return lines + saturation_warning(sensor, accel_mps2, gyro_radps)
+
+
+def slow_warning(sensor: str, stamps_ns: NDArray[np.int64], config: ImuConfig) -> list[str]:
+    """Return a line on an IMU whose samples, at stamps (N,), are so far apart that each interval is a gap, and the motion in it unknown."""
+    apart_s = float(np.median(np.diff(stamps_ns))) / NS_PER_S if len(stamps_ns) > 1 else 0.0
+    if apart_s <= config.max_gap_s:
+        return []
+    said = f"{sensor}: its samples come {apart_s:.1f} s apart, more than max_gap_s ({config.max_gap_s:g} s): each interval is a gap"
+    return [f"{said}, and nothing tells the motion in it; online it does not start: record the IMU at 50 Hz or more"]
 
 
 def fast_warning(imu: ImuSeries, config: ImuConfig) -> list[str]:

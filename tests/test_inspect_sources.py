@@ -21,11 +21,12 @@ from graphloc.config import (
     load_config,
     parse_config,
 )
-from graphloc.errors import InputError
+from graphloc.errors import InputError, SolveError
 from graphloc.frames import Array
 from graphloc.frontends.inspect import Inspection, draft_config, render
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition
+from graphloc.replay import replay
 from tests.bagfactory import START_NS, Item, Messages, S
 from tests.heldbags import hold_bag, inspect_bag, read_recording
 from tests.makers import said
@@ -1099,6 +1100,25 @@ def test_the_unit_of_a_robot_that_trots_is_told_by_its_turns(scale: float, tmp_p
     assert config.sensors["imu"].gyro_unit == ("rad/s" if scale == 1.0 else "deg/s")
     assert ("it turns as the courses of the fixes do in deg/s" in text) == (scale != 1.0)
     assert not [w for w in read_recording(tmp_path / "run", config).warnings if "looks like deg/s" in w]
+
+
+@pytest.mark.parametrize("every", [1, 50])
+def test_an_imu_that_is_too_slow_is_said(every: int, tmp_path: Path) -> None:
+    """A logger that keeps one message a second: offline the antenna was 31 m from its mount, online it waited for IMU data, with no word why."""
+    make = Messages(2)
+    plain = drive(make, seconds=60)
+    imu = [item for item in plain if item[0] == "/imu"][::every]
+    items = sorted([*imu, *(item for item in plain if item[0] != "/imu")], key=lambda item: item[1])
+    found, config, _ = look(tmp_path, items, make)
+    said = "its samples come 1.0 s apart, more than max_gap_s (0.5 s): each interval is a gap"
+    assert (said in render(found)) == (every == 50)
+    recording = read_recording(tmp_path / "run", config)
+    assert [said in w for w in recording.warnings if "apart" in w] == [True] * (every == 50)
+    if every == 50:
+        with pytest.raises(
+            SolveError, match=r"waiting for 5 s of IMU data, whose samples come 1\.0 s apart, more than"
+        ):
+            replay(recording, config)
 
 
 def stamped_late(make: Messages, late_s: float, *, seconds: int, noise_m: float) -> list[Item]:
