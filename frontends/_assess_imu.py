@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +30,7 @@ from graphloc.frontends._sanity import (
 )
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import Pose, StaticTree
-from graphloc.frontends._turns import unit_of_turns
+from graphloc.frontends._turns import Yaws, unit_of_turns
 from graphloc.frontends.turning import Turning, course_against_turning, left_of_turns
 from graphloc.measurements import ImuSeries
 from graphloc.signals.frozen_imu import frozen_imu_warning, frozen_samples
@@ -77,11 +77,12 @@ class _Samples(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuEvidence:
-    """What an IMU is judged by: how the craft moved, by each source, the courses of the fixes, and tf."""
+    """What an IMU is judged by: how the craft moved, by each source, the courses of the fixes, tf, and the yaws that odometries and poses tell, by topic."""
 
     motions: Sequence[MeasuredMotion]
     courses: Courses | None
     tree: StaticTree
+    yaws: Mapping[str, Yaws] = field(default_factory=dict)
 
     def pose_of(self, frame: str | None) -> Pose | None:
         """Return T_body_frame by tf; None where it does not know the frame."""
@@ -380,7 +381,7 @@ def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
     missing = missing_half(accel, gyro)
     units = _units_of(
         ImuSeries(sensor=imu.topic, stamps_ns=stamps, accel_mps2=accel, gyro_radps=gyro, seqs=np.arange(len(stamps))),
-        evidence.courses,
+        _yaws_beside(stamps, rows[:, 6:10], evidence),
     )
     accel = accel * (STANDARD_GRAVITY_MPS2 if units.accel == "g" else 1.0)
     gyro = gyro * (np.pi / 180.0 if units.gyro == "deg/s" else 1.0)
@@ -435,15 +436,38 @@ class _Units(NamedTuple):
     why: tuple[str, ...]
 
 
-def _units_of(imu: ImuSeries, courses: Courses | None) -> _Units:
-    """Return the likely units of samples as they are told: of rates by how they turn beside the courses; where that is not clear, by their size."""
+def _yaws_beside(stamps: NDArray[np.int64], orientation: Array, evidence: ImuEvidence) -> dict[str, Yaws]:
+    """Return what turns with an IMU, by what it does: its own orientation (N, 4), at stamps (N,), where it has one; odometries and poses; courses."""
+    own = yaws_of(stamps, orientation)
+    found = {"its own orientation does": own} if own else {}
+    found |= {f"the poses of {topic} do": yaws for topic, yaws in evidence.yaws.items()}
+    if (courses := evidence.courses) is not None:
+        found["the courses of the fixes do"] = courses.stamps_ns, courses.course_rad
+    return found
+
+
+def yaws_of(stamps: NDArray[np.int64], quaternions: Array) -> Yaws | None:
+    """Return the stamps and yaws of attitudes (N, 4), at stamps (N,); None where half of them are none."""
+    whole = np.isfinite(quaternions).all(axis=1) & (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) < 0.1)
+    if not len(whole) or whole.mean() <= 0.5:
+        return None
+    x, y, z, w = quaternions[whole].T
+    return stamps[whole], np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def _units_of(imu: ImuSeries, beside: Mapping[str, Yaws]) -> _Units:
+    """Return the likely units of samples as they are told: of rates by how they turn beside what turns with them; where that is not clear, by their size.
+
+    Where gravity does not turn either, as of a robot that pivots, size alone takes rad/s for deg/s.
+    """
     stamps, accel, gyro = imu.stamps_ns, imu.accel_mps2, imu.gyro_radps
     size, at_ease = size_at_ease(accel, gyro)
     rate = float(np.median(np.linalg.norm(gyro, axis=1)))
     gravity = "removed" if without_gravity(accel) else "included"
     accel_unit = "g" if gravity == "included" and 0.9 < size < 1.1 else "m/s^2"
     si = replace(imu, accel_mps2=accel * (STANDARD_GRAVITY_MPS2 if accel_unit == "g" else 1.0))
-    turns = unit_of_turns(si, (courses.stamps_ns, courses.course_rad)) if courses is not None else None
+    told = ((unit, by) for by, yaws in beside.items() if (unit := unit_of_turns(si, yaws)))
+    turns, as_turns = next(told, (None, ""))
     fast = rate > NEVER_STILL_RADPS and not turns_gravity(stamps, accel, gyro)
     gyro_unit = turns or ("deg/s" if fast else "rad/s")
     why = []
@@ -454,7 +478,7 @@ def _units_of(imu: ImuSeries, courses: Courses | None) -> _Units:
     if accel_unit == "m/s^2" and gravity == "included" and no_gravity_in_si(size, at_ease):
         why.append(f"median acceleration is {size:.2f}: neither m/s^2 nor g with gravity; check the sensor")
     if turns == "deg/s":
-        why.append("it turns as the courses of the fixes do in deg/s")
+        why.append(f"it turns as {as_turns} in deg/s")
     elif gyro_unit == "deg/s":
         why.append(f"median rate is {rate:.2f}: too much for rad/s, looks like deg/s")
     return _Units(accel_unit, gyro_unit, gravity, size, tuple(why))

@@ -29,6 +29,7 @@ from graphloc.frontends._assess_imu import (
     inertial_of,
     turned_as_headed,
     turned_as_its_heading,
+    yaws_of,
 )
 from graphloc.frontends._assess_receivers import TWO_CRAFT_M, apart_warning
 from graphloc.frontends._assess_velocity import motion_of_poses, motions_of, odometry_report, velocity_report
@@ -115,7 +116,8 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     velocities = _velocity_reports(bag, reference)
     motions = _motions(bag, reference, odometry, velocities)
     courses = courses_of(reference) if len(reference.stamps_ns) else None
-    evidence = ImuEvidence(motions, courses, bag.tree)
+    posed = {s.topic: yaws for s in bag.of_type(*POSE_TYPES) if (yaws := yaws_of(s.stamps_ns, s.rows[:, 3:7]))}
+    evidence = ImuEvidence(motions, courses, bag.tree, posed)
     imus, in_body = _in_axes_up(bag, gnss, _imu_reports(bag, evidence))
     best = _best_imu(bag, imus, evidence)
     compasses = compasses_of(bag, courses, best)

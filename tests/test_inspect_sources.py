@@ -1102,6 +1102,29 @@ def test_the_unit_of_a_robot_that_trots_is_told_by_its_turns(scale: float, tmp_p
     assert not [w for w in read_recording(tmp_path / "run", config).warnings if "looks like deg/s" in w]
 
 
+@pytest.mark.parametrize("told_by", ["odometry", "itself"])
+@pytest.mark.parametrize("scale", [1.0, 180.0 / np.pi], ids=["rad/s", "deg/s"])
+def test_the_unit_of_a_robot_that_pivots_is_told_by_its_attitude(scale: float, told_by: str, tmp_path: Path) -> None:
+    """At 1.2 rad/s and level: gravity does not turn, and courses are no headings. deg/s were drafted, and the heading was 108 deg off."""
+    make, rate = Messages(2), 1.2
+    items = []
+    for topic, at, m in drive(make, gyro_scale=scale, seconds=60):
+        t = (at - START_NS) / S
+        yaw = 10.0 * (rate / 2.0) * np.sin(t / 5.0) + rate * t
+        spun = Rotation.from_euler("z", yaw).as_quat().tolist()
+        if topic == "/imu":
+            v = m.angular_velocity
+            own = (spun, np.zeros(9)) if told_by == "itself" else ()
+            gyro = (v.x, v.y, scale * (rate * np.cos(t / 5.0) + rate))
+            items.append((topic, at, make.imu(at, (0.0, 0.0, G), gyro, *own)))
+        elif topic == "/fix":
+            items.append((topic, at, make.fix(at, 57.7, 11.9, 40.0)))
+        elif topic == "/wheel/odom" and told_by == "odometry":
+            items.append((topic, at, make.odometry(at, (0, 0, 0), spun)))
+    found, _, _ = look(tmp_path, items, make)
+    assert found.imus[0].gyro_unit == ("rad/s" if scale == 1.0 else "deg/s")
+
+
 @pytest.mark.parametrize("every", [1, 50])
 def test_an_imu_that_is_too_slow_is_said(every: int, tmp_path: Path) -> None:
     """A logger that keeps one message a second: offline the antenna was 31 m from its mount, online it waited for IMU data, with no word why."""
