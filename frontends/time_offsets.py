@@ -23,7 +23,6 @@ from graphloc.frontends._clock import (
 from graphloc.frontends._mount_yaw import FEWEST, MOVES_M, STEP_S, Felt, bent, unbroken, windows_of
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._turns import without_line
-from graphloc.frontends.decode import UNSTAMPED
 from graphloc.frontends.turning import Turning
 from graphloc.signals.series import integral
 from graphloc.time import NS_PER_S
@@ -134,21 +133,17 @@ def motion_time_offsets(
     Args:
         imu: whose accelerations are felt. streams: by topic, on one clock.
     """
+    imu_s = usual_latency_s(imu.stamps_ns, imu.logs_ns)
+    # Where recording times were made of the stamps they tell nothing.
+    copied = not imu.recorded and np.array_equal(imu.stamps_ns, imu.logs_ns)
 
     def most_s(motion: MeasuredMotion) -> float:
-        own_s, imu_s = (_way_s(stream) for stream in (streams.get(motion.source), imu))
-        return FARTHEST_LATE_S if own_s is None or imu_s is None else most_early_s(own_s, imu_s)
+        own = streams.get(motion.source)
+        if own is None or copied:
+            return FARTHEST_LATE_S
+        return most_early_s(usual_latency_s(own.stamps_ns, own.logs_ns), imu_s)
 
     return {motion.source: motion_time_offset(felt, motion, most_s(motion)) for motion in motions}
-
-
-def _way_s(stream: TopicData | None) -> float | None:
-    """Return how long after its stamps a topic is recorded, s; None where recording times were made of the stamps, and tell nothing."""
-    if stream is None:
-        return None
-    unstamped = stream.recorded or stream.msgtype in UNSTAMPED
-    copied = not unstamped and np.array_equal(stream.stamps_ns, stream.logs_ns)
-    return None if copied else usual_latency_s(stream.stamps_ns, stream.logs_ns)
 
 
 def motion_time_offset(felt: Felt, motion: MeasuredMotion, most_s: float = FARTHEST_LATE_S) -> MotionOffset | None:
