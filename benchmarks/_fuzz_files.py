@@ -6,18 +6,14 @@ from __future__ import annotations
 import copy
 import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _fuzz_messages import FLOATS, TEXTS, Rng
+from _fuzz_messages import FLOATS, TEXTS, Rng, pick
 
 LENGTHS = (0, 1, 2**16, 2**31 - 1, 2**32 - 1, 2**34, 2**40, 2**63 - 1, 2**64 - 1)
-
-
-def _pick(rng: Rng, values: Sequence[Any]) -> Any:
-    return values[int(rng.integers(len(values)))]
 
 
 def _place(rng: Rng, size: int) -> int:
@@ -30,7 +26,7 @@ def _place(rng: Rng, size: int) -> int:
 def damaged(rng: Rng, content: bytes) -> bytes:
     """Bytes cut, flipped, zeroed, doubled, swapped, or given a length that lies."""
     data = bytearray(content)
-    way = _pick(rng, ("cut", "flip", "flips", "zero", "insert", "double", "length", "drop", "noise"))
+    way = pick(rng, ("cut", "flip", "flips", "zero", "insert", "double", "length", "drop", "noise"))
     at = _place(rng, len(data))
     if way == "cut":
         return bytes(data[:at])
@@ -45,10 +41,8 @@ def damaged(rng: Rng, content: bytes) -> bytes:
     elif way == "double":
         data[at:at] = data[at : at + int(rng.integers(1, 5000))]
     elif way == "length":
-        form = _pick(rng, ("<Q", "<L", ">L"))
-        data[at : at + struct.calcsize(form)] = struct.pack(
-            form, _pick(rng, LENGTHS) % 2 ** (8 * struct.calcsize(form))
-        )
+        form = pick(rng, ("<Q", "<L", ">L"))
+        data[at : at + struct.calcsize(form)] = struct.pack(form, pick(rng, LENGTHS) % 2 ** (8 * struct.calcsize(form)))
     elif way == "drop":
         del data[at : at + int(rng.integers(1, 5000))]
     else:
@@ -61,7 +55,7 @@ def damage_file(rng: Rng, path: Path) -> None:
     """Damage a file in its place; of a folder one of its files."""
     if path.is_dir():
         files = sorted(p for p in path.rglob("*") if p.is_file())
-        path = _pick(rng, files)
+        path = pick(rng, files)
     if path.name == "metadata.yaml":
         path.write_bytes(hostile_text(rng, path.read_text(errors="replace")))
     else:
@@ -88,17 +82,17 @@ def hostile_text(rng: Rng, text: str) -> bytes:
     k = int(rng.integers(len(lines) or 1))
     if way == 0:
         key = lines[k].split(":")[0]
-        lines[k] = f"{key}: {_pick(rng, _TAGS)}"
+        lines[k] = f"{key}: {pick(rng, _TAGS)}"
     elif way == 1:
         return (_BOMB + "\n".join([*lines, "sensors: *j"])).encode()
     elif way == 2:
-        depth = int(_pick(rng, (50, 1000, 20000)))
-        opened, closed = _pick(rng, (("[", "]"), ("{a: ", "}")))
+        depth = int(pick(rng, (50, 1000, 20000)))
+        opened, closed = pick(rng, (("[", "]"), ("{a: ", "}")))
         lines.append("deep: " + opened * depth + closed * depth)
     elif way == 3:
-        return _pick(rng, (b"\xff\xfe", b"\xef\xbb\xbf", b"\x00", b"\x80\x81")) + text.encode()
+        return pick(rng, (b"\xff\xfe", b"\xef\xbb\xbf", b"\x00", b"\x80\x81")) + text.encode()
     elif way == 4:
-        return text.encode(str(_pick(rng, ("utf-16", "utf-32"))))
+        return text.encode(str(pick(rng, ("utf-16", "utf-32"))))
     elif way == 5:
         del lines[k]
     elif way == 6:
@@ -113,7 +107,7 @@ def hostile_text(rng: Rng, text: str) -> bytes:
         lines[k] = (
             lines[k].split(":")[0]
             + ": "
-            + _pick(rng, ("1e400", ".nan", "-.inf", "1" * 6000, "0o777", "*none", "&x", "@", "`", "%"))
+            + pick(rng, ("1e400", ".nan", "-.inf", "1" * 6000, "0o777", "*none", "&x", "@", "`", "%"))
         )
     else:
         lines.append("<<: {a: 1}\n? [1, 2]\n: 3\n... \n--- \nb: 2")
@@ -129,7 +123,7 @@ def hostile_tree(rng: Rng, tree: Mapping[str, Any]) -> dict[str, Any]:
             keys = list(node) if isinstance(node, dict) else list(range(len(node)))
             if not keys:
                 break
-            key = _pick(rng, keys)
+            key = pick(rng, keys)
             if isinstance(node[key], dict | list) and node[key] and rng.random() < 0.85:
                 node = node[key]
                 continue
@@ -143,13 +137,13 @@ def _change(rng: Rng, node: Any, key: Any) -> None:
     if way == 0 and isinstance(node, dict):
         del node[key]
     elif way == 1 and isinstance(node, dict):
-        node[_pick(rng, (*TEXTS[:8], f"{key}s", str(key).upper(), "kind", "topic"))] = node.pop(key)
+        node[pick(rng, (*TEXTS[:8], f"{key}s", str(key).upper(), "kind", "topic"))] = node.pop(key)
     elif way == 2 and isinstance(node, dict):
-        node[_pick(rng, ("unknown", f"{key}_m", "sensors", "enabled", "kernel"))] = _pick(rng, VALUES)
+        node[pick(rng, ("unknown", f"{key}_m", "sensors", "enabled", "kernel"))] = pick(rng, VALUES)
     elif way in (3, 4) and isinstance(node[key], float) and not isinstance(node[key], bool):
-        node[key] = node[key] * float(10.0 ** rng.integers(-12, 13)) * float(_pick(rng, (1, 1, -1)))
+        node[key] = node[key] * float(10.0 ** rng.integers(-12, 13)) * float(pick(rng, (1, 1, -1)))
     else:
-        node[key] = copy.deepcopy(_pick(rng, VALUES))
+        node[key] = copy.deepcopy(pick(rng, VALUES))
 
 
 def hostile_json(rng: Rng, line: Mapping[str, Any]) -> bytes:

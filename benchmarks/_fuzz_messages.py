@@ -46,20 +46,20 @@ def leaves(msg: Any, path: str = "") -> Iterator[Leaf]:
             yield Leaf(msg, field.name, here)
 
 
-def _pick(rng: Rng, values: Sequence[Any]) -> Any:
+def pick(rng: Rng, values: Sequence[Any]) -> Any:
     return values[int(rng.integers(len(values)))]
 
 
 def hostile(rng: Rng, value: Any) -> Any:
     """Something of the same type."""
     if isinstance(value, str):
-        return _pick(rng, TEXTS)
+        return pick(rng, TEXTS)
     if isinstance(value, bool | np.bool_):
         return not value
     if isinstance(value, int | np.integer):
-        return _pick(rng, INTS) if rng.random() < 0.7 else int(value) + int(rng.integers(-3, 4))
+        return pick(rng, INTS) if rng.random() < 0.7 else int(value) + int(rng.integers(-3, 4))
     if isinstance(value, float | np.floating):
-        return _pick(rng, FLOATS) if rng.random() < 0.8 else float(value) * float(10.0 ** rng.uniform(-9, 9))
+        return pick(rng, FLOATS) if rng.random() < 0.8 else float(value) * float(10.0 ** rng.uniform(-9, 9))
     if isinstance(value, np.ndarray):
         return _hostile_array(rng, value)
     return value
@@ -75,11 +75,11 @@ def _hostile_array(rng: Rng, value: Any) -> Any:
     if way == 2:
         return np.concatenate([changed, changed])
     if way == 3 and value.dtype.kind == "f":
-        changed[:] = _pick(rng, FLOATS)
+        changed[:] = pick(rng, FLOATS)
     elif len(changed):
         for k in rng.integers(len(changed), size=int(rng.integers(1, 9))):
             if value.dtype.kind == "f":
-                changed[k] = _pick(rng, FLOATS)
+                changed[k] = pick(rng, FLOATS)
             else:
                 changed[k] = rng.integers(256)
     return changed
@@ -104,11 +104,11 @@ def _edited(
 
 def _some_topics(raws: Sequence[Raw], rng: Rng) -> list[str]:
     every = sorted({raw.topic for raw in raws})
-    return every if rng.random() < 0.2 else [_pick(rng, every)]
+    return every if rng.random() < 0.2 else [pick(rng, every)]
 
 
 def _share(rng: Rng) -> float:
-    return float(_pick(rng, (0.02, 0.2, 1.0)))
+    return float(pick(rng, (0.02, 0.2, 1.0)))
 
 
 def fields(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
@@ -139,9 +139,7 @@ def many_fields(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
 
 def stamps(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
     """Header stamps: zero, negative, 2038, shuffled, equal, backward, another epoch, jitter, with and without log times."""
-    way = _pick(
-        rng, ("zero", "negative", "last", "nanosec", "equal", "reversed", "epoch", "jitter", "jump", "shuffled")
-    )
+    way = pick(rng, ("zero", "negative", "last", "nanosec", "equal", "reversed", "epoch", "jitter", "jump", "shuffled"))
     topics = _some_topics(raws, rng)
     stamped = [r for r in raws if r.topic in topics]
     first_s = min((r.log_ns for r in raws), default=0) // 10**9
@@ -169,7 +167,7 @@ def stamps(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
             total = stamp.sec * 10**9 + stamp.nanosec + int(rng.normal(0, 10.0 ** rng.uniform(3, 9)))
             stamp.sec, stamp.nanosec = total // 10**9, total % 10**9
         elif way == "jump":
-            stamp.sec += int(_pick(rng, (-1000, -5, 5, 40, 3600, 10**8)))
+            stamp.sec += int(pick(rng, (-1000, -5, 5, 40, 3600, 10**8)))
         elif len(pool):
             log = stamped[int(pool[k % len(pool)])].log_ns
             stamp.sec, stamp.nanosec = log // 10**9, log % 10**9
@@ -179,7 +177,7 @@ def stamps(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
 
 def order(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
     """Messages dropped, doubled, recorded in another order or at other times; topics that end or begin midway."""
-    way = _pick(rng, ("drop", "double", "shuffle", "log", "cut", "late", "few", "same"))
+    way = pick(rng, ("drop", "double", "shuffle", "log", "cut", "late", "few", "same"))
     topics = _some_topics(raws, rng)
     share = _share(rng)
     middle = raws[len(raws) // 2].log_ns
@@ -191,7 +189,7 @@ def order(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
         elif way == "double":
             out += [raw] * int(rng.integers(2, 5))
         elif way == "log":
-            out.append(replace(raw, log_ns=int(_pick(rng, (0, 1, 2**63 - 2, middle, raw.log_ns - 10**12, 10**18)))))
+            out.append(replace(raw, log_ns=int(pick(rng, (0, 1, 2**63 - 2, middle, raw.log_ns - 10**12, 10**18)))))
         elif way == "cut":
             out += [raw] if raw.log_ns < middle else []
         elif way == "late":
@@ -209,7 +207,7 @@ def order(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
 def payloads(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
     """Bytes of messages: cut, flipped, empty, those of another topic, lengths that lie."""
     topics, share = _some_topics(raws, rng), _share(rng)
-    way = _pick(rng, ("cut", "flip", "empty", "other", "length", "noise"))
+    way = pick(rng, ("cut", "flip", "empty", "other", "length", "noise"))
 
     def broken(raw: Raw) -> bytes:
         data = bytearray(raw.data)
@@ -221,10 +219,10 @@ def payloads(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
             return bytes(data)
         if way == "length":
             at -= at % 4
-            data[at : at + 4] = int(_pick(rng, (2**32 - 1, 2**31, 2**30, 10**6, 0))).to_bytes(4, "little")
+            data[at : at + 4] = int(pick(rng, (2**32 - 1, 2**31, 2**30, 10**6, 0))).to_bytes(4, "little")
             return bytes(data)
         if way == "other":
-            return bytes(_pick(rng, raws).data)
+            return bytes(pick(rng, raws).data)
         return rng.bytes(int(rng.integers(400))) if way == "noise" else b""
 
     return [replace(r, data=broken(r)) if r.topic in topics and rng.random() < share else r for r in raws]
@@ -233,13 +231,13 @@ def payloads(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
 def types_of(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
     """Topics that hold something else, have other names, or swap their messages."""
     every = sorted({raw.topic for raw in raws})
-    one, other = _pick(rng, every), _pick(rng, every)
+    one, other = pick(rng, every), pick(rng, every)
     way = rng.integers(3)
     if way == 0:
         kind = next(r.msgtype for r in raws if r.topic == other)
         return [replace(r, msgtype=kind) if r.topic == one else r for r in raws]
     if way == 1:
-        name = "/" + _pick(rng, TEXTS).strip("/").replace("\x00", "0")[:200]
+        name = "/" + pick(rng, TEXTS).strip("/").replace("\x00", "0")[:200]
         return [replace(r, topic=name) if r.topic == one else r for r in raws]
     swap = {one: other, other: one}
     return [replace(r, topic=swap.get(r.topic, r.topic)) for r in raws]
@@ -247,7 +245,7 @@ def types_of(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
 
 def covariances(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
     """Covariances: huge, tiny, negative, not symmetric, not positive; quaternions of no length."""
-    value = _pick(rng, (*FLOATS, 1e-12, 1e12))
+    value = pick(rng, (*FLOATS, 1e-12, 1e12))
     way = int(rng.integers(4))
 
     def change(msg: Any) -> None:
@@ -259,7 +257,7 @@ def covariances(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
                 made = have.reshape(n, n) * value if made is None else made
                 setattr(leaf.owner, leaf.name, made.ravel())
             if way == 3 and ("orientation" in leaf.path or "quaternion" in leaf.path) and isinstance(have, float):
-                setattr(leaf.owner, leaf.name, _pick(rng, (0.0, 1.0, float("nan"), 1e-200, 1e200)))
+                setattr(leaf.owner, leaf.name, pick(rng, (0.0, 1.0, float("nan"), 1e-200, 1e200)))
 
     with np.errstate(all="ignore"):
         return _edited(raws, types, rng, _share(rng), sorted({r.topic for r in raws}), change)
@@ -286,7 +284,7 @@ def shapes(raws: Sequence[Raw], types: Messages, rng: Rng) -> list[Raw]:
             data[:, :12] = points.view(np.uint8)
             msg.data = data.ravel()
             return
-        leaf = _pick(rng, every)
+        leaf = pick(rng, every)
         setattr(leaf.owner, leaf.name, hostile(rng, getattr(leaf.owner, leaf.name)))
 
     return _edited(raws, types, rng, _share(rng), sorted(set(topics)), change)

@@ -131,6 +131,7 @@ def _attachment(solution: Solution, there: _There, t: Array, R: Array) -> Attach
         T_world_body=there.T_world_body,
         v_world_mps=there.v_world_mps,
         T_state_sensor=gtsam.Pose3(gtsam.Rot3(R), t),
+        carried_m=np.zeros(3),
         dv_world_mps=np.zeros(3),
         gyro_radps=there.gyro_radps,
         lever_m=t,

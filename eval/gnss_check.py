@@ -26,7 +26,7 @@ from graphloc.eval.metrics import Levers, receiver_errors
 from graphloc.frames import Array, Datum, heading_deg_from_yaw
 from graphloc.measurements import GnssPosition
 from graphloc.recording import Recording
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, duration_ns
 from graphloc.trajectory import Trajectory
 
 _STEADY = 0.5  # RMS about the mean, as a share of it
@@ -126,7 +126,7 @@ def _steady(off_m: Array) -> tuple[float, Array]:
 
 def _means(stamps_ns: NDArray[np.int64], off_m: Array) -> Array:
     """Return the means (B, k) of errors (N, k), m, over blocks of ten seconds, in which white noise averages out."""
-    _, block = np.unique((stamps_ns - stamps_ns[0]) // int(_BLOCK_S * NS_PER_S), return_inverse=True)
+    _, block = np.unique((stamps_ns - stamps_ns[0]) // duration_ns(_BLOCK_S), return_inverse=True)
     count = np.bincount(block)
     return np.column_stack([np.bincount(block, weights=column) / count for column in off_m.T])
 

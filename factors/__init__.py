@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Table of sensors. A sensor is its measurement, its configuration, its file here, and one entry in the table.
+"""Table of sensors. A sensor is a class of measurements, a configuration, a file here, and one entry in the table.
 
 Sensors of other packages join it by entry points (docs/adding-a-sensor.md).
 """

@@ -31,7 +31,7 @@ def with_floors(cov: Array, floors: Array | float) -> Array:
 
 
 def walked(residual: Residual, by: Array | float) -> Residual:
-    """Return a residual with what its slow error walks by between its nodes (k, k)."""
+    """Return a residual whose covariance is larger by `by` (k, k): by what its slow error walks between two nodes."""
     cov = residual.cov + by
     expected = float(np.trace(np.linalg.solve(cov, residual.cov)))
     return replace(residual, cov=cov, white=residual.cov, expected_nis=expected)

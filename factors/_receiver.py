@@ -13,7 +13,10 @@ _NOT_OFF = np.zeros(3)
 
 
 def stamps_and_antenna(config: GnssConfig | VelocityConfig) -> tuple[Constant, ...]:
-    """Return how much later than stamped a receiver measures, s, and how far off its antenna is (3,), m, as far as that is not known."""
+    """Return the constant of a receiver: delay of its stamps, s, and place of its antenna less that of its mount (3,), m, where unknown.
+
+    The delay is the time of measurement less the stamp.
+    """
     unknown: dict[str, float] = {}
     if config.stamp_sigma_s > 0.0:
         unknown[TIME_OFFSET] = config.stamp_sigma_s
@@ -21,13 +24,13 @@ def stamps_and_antenna(config: GnssConfig | VelocityConfig) -> tuple[Constant, .
         unknown |= dict.fromkeys(PLACE, config.mount_sigma_m)
     if not unknown:
         return ()
-    # One of all: a linear factor of more than three states takes longer to make.
+    # One constant holds both: a linear factor of more than three states takes longer to make.
     return (Constant(name="stamps and antenna", sigma=np.array([*unknown.values()]), corrects=tuple(unknown)),)
 
 
 def late_and_off(at: Attachment, config: GnssConfig | VelocityConfig) -> tuple[float, Array]:
-    """Return the estimates of both, s and m, the latter in the antenna's axes; zero where they are not estimated."""
-    if not at.constants:  # of a sensor with none, or taken as configured to examine that
+    """Return the estimated delay, s, and the antenna's place less that of its mount (3,), m, its axes; zero where not estimated."""
+    if not at.constants:  # there are none, or the configured values are to be examined
         return 0.0, _NOT_OFF
     value, own = at.constants[0][1], at.own_of(0)
     value = value[list(own)] if own else value

@@ -17,7 +17,7 @@ from graphloc.linear import Term, linear_update, pose_term
 from graphloc.measurements import TagSighting
 from graphloc.survey import DockConfig
 
-# Where a sighting stands on a node: m, rad of a dock; rad of a mount; s; px.
+# Least sigmas that tie a leaf to a node, where the sighting is at the node's time: m and rad of a dock; rad of a mount; s; px.
 _TIE_DOCK, _TIE_MOUNT, _TIE_LATE, _TIE_EDGE = (1e-4,) * 3 + (1e-5,) * 3, (1e-5,) * 3, (1e-5,), (1e-4,)
 
 
@@ -56,9 +56,8 @@ def corner_factors(
     by_slow = seen.placed(by_slow) if tie is None else by_slow
     found: list[Any] = [] if tie is None else list(tie.factors)
     points = gtsam.Values()
-    for k, constant in enumerate(
-        corners.survey_errors
-    ):  # GTSAM's linear factors have at most three keys: one for each tag
+    # GTSAM's linear factors have at most three keys: so one factor for each tag.
+    for k, constant in enumerate(corners.survey_errors):
         own = slice(8 * k, 8 * k + 8)
         of_tag = Residual(
             raw=raw[own], cov=m.cov[own, own], jacobian=lambda: np.zeros((8, 6)), prior=1.0, size_m=None, size_deg=None
@@ -93,7 +92,7 @@ def _tie(seen: TagsSeen, dock: DockConfig, config: AprilTagConfig, at: Attachmen
     sigma = np.concatenate([sigma, np.zeros(still), [config.edge_sigma_px] * seen.edges])
     time_s = np.concatenate([time_s, np.full(still, np.inf), [EDGE_TIME_S] * seen.edges])
     tie = np.array(_TIE_DOCK + _TIE_MOUNT * seen.mounted + _TIE_LATE * seen.timed + _TIE_EDGE * seen.edges)
-    if at.slow_next is None:  # it has gone on by itself
+    if at.slow_next is None:  # no next node yet: the process goes on freely from the node before
         kept = np.exp(-at.slow_age_s / time_s)
         expected, bridge = kept * np.asarray(at.slow_value)[seen.own], sigma * np.sqrt(1.0 - kept**2)
     else:
@@ -114,7 +113,7 @@ def _tie(seen: TagsSeen, dock: DockConfig, config: AprilTagConfig, at: Attachmen
 
 
 def _outwards(rays: Array) -> Array:
-    """Return how corners (n, 2) move per unit by which the edges of their tags move outwards."""
+    """Return the shift (n, 2) of corners, as rays, where all edges of their tags move outwards by one."""
     tags = rays.reshape(-1, 4, 2)
     along = tags[:, [1, 2, 3, 0]] - tags
     along /= np.maximum(np.hypot(along[..., :1], along[..., 1:]), 1e-12)

@@ -22,9 +22,9 @@ class Corners(NamedTuple):
     """The n corners of K tags by the estimate.
 
     Attributes:
-        points_m: (n, 3) in world. arms_m: (n, 3) from the dock's pivot, in world.
-        within_m: (K, 4, 3) from the middle of each tag, at rest. toward_m: (n, 3) in the camera.
-        survey_errors: of each tag; None for tags without one.
+        points_m: (n, 3) in world. arms_m: (n, 3) seen from the dock's pivot, axes of world.
+        within_m: (K, 4, 3) seen from the middle of each tag, its dock at rest. toward_m: (n, 3) seen from the camera, its axes.
+        survey_errors: of each tag; None where the survey error is not estimated.
     """
 
     points_m: Array
@@ -35,15 +35,17 @@ class Corners(NamedTuple):
 
 
 class TagsSeen:
-    """A sighting at the linearisation point.
+    """A sighting at the linearisation point; symbols as in the docstring of `apriltag`.
 
     Attributes:
-        R, p: camera in world. middle_m: (3,) the tags' middle in world, docks as they are now; middle_at_rest_m: at rest.
-        body: (6, 6) d (position, rotation about world axes) of the camera / d tangent of the state.
-        by_mount: (3, 3) d that rotation / d u. by_late: (6,) d (position, rotation) / d l. by_turn: (3, 3) of the dock.
+        R, p: camera in world.
+        middle_m: (3,) mean of the corners in world, their dock where the estimate has it. middle_at_rest_m: the dock at rest.
+        body: (6, 6) d (position, rotation about world axes) of the camera / d (body tangent of the state's pose).
+        by_mount: (3, 3) d (rotation of the camera) / d u. by_late: (6,) d (position, rotation of the camera) / d l.
+        turn: (3, 3) Exp(w) of the dock. by_turn: (3, 3) d (rotation of the dock about world axes) / d w.
         own: rows of the slow state that the sighting depends on, in the order dock (6), mount (3), stamp (1), edge (1).
-            Whether each is there: rides, mounted, timed, edges.
-        slow: their values; moved: (6,) of the dock; edge_px: b.
+        rides, mounted, timed, edges: whether each of these four is among them.
+        slow: values of these rows. slow_size: length of the whole slow state. moved: (6,) d and w of the dock. edge_px: b.
     """
 
     def __init__(self, m: TagSighting, config: AprilTagConfig, at: Attachment) -> None:
@@ -57,7 +59,9 @@ class TagsSeen:
         self.rides, self.mounted, self.timed, self.edges = (len(r) > 0 for r in rows)
         self.own = [k for r in rows for k in r]
         self.slow = np.zeros(0)
-        if at.slow_value is not None:  # of tags at rest the value at the node before: they have no leaf in between
+        if (
+            at.slow_value is not None
+        ):  # interpolated for tags on a dock; else that of the node: such sightings have no leaf
             self.slow = (_between(at) if self.rides else np.asarray(at.slow_value))[self.own]
         self.moved = self.slow[:6] if self.rides else np.zeros(6)
         self.edge_px = float(self.slow[-1]) if self.edges else 0.0
@@ -65,11 +69,12 @@ class TagsSeen:
     def _place_camera(self, m: TagSighting, at: Attachment) -> None:
         T_state_camera = at.T_state_sensor.compose(gtsam.Pose3(gtsam.Rot3(m.R_body_camera), m.t_body_camera_m))
         T_world_camera = at.T_world_body.compose(T_state_camera)
-        self.R, self.p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation())
+        self.R, self.p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation()) + at.carried_m
         adjoint = np.asarray(T_state_camera.inverse().AdjointMap())
         self.body = np.vstack([self.R @ adjoint[3:], self.R @ adjoint[:3]])
         self.by_mount, self.by_late = np.eye(3), np.zeros(6)
-        R_world_body, arm = self.R @ m.R_body_camera.T, self.p - np.asarray(at.T_world_body.translation())
+        R_world_body = self.R @ m.R_body_camera.T
+        arm = self.p - at.carried_m - np.asarray(at.T_world_body.translation())
         off, late_s = self.slow[6 * self.rides :][:3], self.slow[6 * self.rides + 3 * self.mounted :][: int(self.timed)]
         if self.timed:
             rate = R_world_body @ at.gyro_radps
@@ -109,7 +114,7 @@ class TagsSeen:
         return np.concatenate([self.p + toward - self.middle_m, rotation]), toward
 
     def placed(self, per_own: Array) -> Array:
-        """Put d / d its own rows of the slow state (k, len(own)), or the first of them, where these stand (k, n)."""
+        """Return d / d (slow state) (k, n) from d / d (the rows in `own`, or the first of them) (k, up to len(own))."""
         whole = np.zeros((len(per_own), self.slow_size))
         whole[:, self.own[: per_own.shape[1]]] = per_own
         return whole

@@ -5,7 +5,7 @@ The slow state of an apriltag sensor holds, in this order:
 
 - of each floating dock: translation from rest (m) and small rotation (rad), about the axes of world;
 - of each camera, as configured: error of the mount's rotation (rad, 3), delay of the stamps (s, 1);
-- how far out the edges of tags are seen (px, 1).
+- by how far the edges of tags are seen outside their print (px, 1).
 
 Survey errors of the tags are constants of the run.
 """
@@ -21,7 +21,7 @@ from graphloc.frames import Array
 from graphloc.graph import Constant, SlowProcess
 from graphloc.survey import WORLD, DockConfig, Survey
 
-EDGE_TIME_S = 30.0  # in about this time, range and light change
+EDGE_TIME_S = 30.0  # time constant of how edges are seen: range and light change in about that time
 _FREEDOM = ("east", "north", "up", "roll", "pitch", "yaw")
 _LEAST_M, _LEAST_RAD = 1e-3, float(np.radians(0.01))
 _LEAST = np.repeat([_LEAST_M, _LEAST_RAD], 3)

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matches of LiDAR scans to an aerial image, with several modes; the image is off by some decimetres, mounts by a degree, clocks by 0.05 s.
+"""Matches of LiDAR scans to an aerial image, with several modes, and the errors that all of them share.
 
     z = (x, y, yaw)(T_world_body) + u tau + d + w,   w ~ N(0, C) of the mode
 
-d (3,): misregistration of the image, yaw of the mounts; u: how x, y and yaw change; tau: how much later than stamped a scan was taken
-(negative: it is stamped late). d and tau are constant over the run. The modes are those of `pose`; with d or tau the factor has two states, and is
-relinearised at every pass (`graphloc.linear`). Not handled: of tau what u changes by in that time, and that it tells of the velocity.
+d (3,): misregistration of the image, some decimetres, and yaw error of the mounts, about a degree; u: rate of x, y and yaw; tau: time
+at which a scan was taken less its stamp, about 0.05 s (negative: the stamp is late). d and tau are constant over the run. The modes are
+those of `pose`. With d or tau the factor has two states, and is linearised at every pass (`graphloc.linear`). Not handled: change of
+u within tau; what a delayed match tells of the velocity.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _AXES = ("x", "y", "yaw")
 
 
 def _off_sigma(config: AerialConfig) -> Array:
-    """Return the sigmas (4,) of what all matches are off by: east and north, m, yaw, rad, and the stamps, s."""
+    """Return the sigmas (4,) of the errors that all matches share: east and north, m, yaw, rad, delay of the stamps, s."""
     yaw_rad = float(np.radians(config.mount_sigma_deg)) if "yaw" in config.axes else 0.0
     return np.array([config.image_sigma_m, config.image_sigma_m, yaw_rad, config.stamp_sigma_s])
 

@@ -3,7 +3,7 @@
 
     z_i = pi(R' (P_i - p)) + w_i,   w_i ~ N(0, C),   pi(x, y, z) = (x, y) / z,   R = R_b Exp(u) M,   at t_i - l
     P_i = c + d + Exp(w) (Q_i - c),   Q_i = S_i + e_k + f_k x (S_i - m_k)
-    seen further out from its tag's middle, by b px at each edge
+    z_i is seen farther from its tag's middle, as each edge of the tag is seen b px outwards.
 
 p, R: camera in world; R_b: body in world; M: the configured mount, u its error; t_i: the stamp, l its delay (u, l: constants of
 the run); S_i: a corner as surveyed, its frame at rest; e_k, f_k: survey error of tag k with middle m_k (constants); d, w:
@@ -20,8 +20,8 @@ the mode. The Gaussians of the modes serve to choose one:
 
     e = (p + R t_m - m, Log(R (Exp(w) R_m)'))    t_m: the tags' middle in the camera of mode m
 
-the camera's position if its attitude is the predicted one, and that attitude. Not handled: that the swing of a late camera turns with the
-body (1 % of the slope at 0.1 s late and 0.2 rad/s), and what it tells of the velocity.
+error of the camera's position, where its attitude is the predicted one, and of its attitude. Not handled: that the swing of a late
+camera turns with the body (1 % of the slope at 0.1 s late and 0.2 rad/s); what a delayed sighting tells of the velocity.
 """
 
 from __future__ import annotations
@@ -43,11 +43,13 @@ from graphloc.survey import WORLD
 
 # Where a false sighting may put the camera: a berth further on, turned as one likes within a quarter of a circle.
 FALSE_SPREAD_M, FALSE_SPREAD_RAD = 5.0, float(np.radians(30.0))
-# Added to a mode's sigmas to decide by: corners place a camera to millimetres, and an estimate that has yet to settle
-# is off by more; what is called false is off by metres.
+# Added to a mode's sigmas where modes are chosen: corners place a camera to millimetres, and an estimate that has yet to settle is
+# off by more than that. A false sighting is off by metres.
 _TO_DECIDE = np.array([0.05] * 3 + [np.radians(0.5)] * 3)
-_AHEAD = 0.3  # of a mode's distances: nearer than that the estimate's own are not believed
-_BY_A_MODE_RAD = float(np.radians(20.0))
+_AHEAD = (
+    0.3  # share of the tags' distance by a mode: where the estimate has a corner nearer, it is not linearised there
+)
+_BY_A_MODE_RAD = float(np.radians(20.0))  # off a mode's attitude, within which the estimate leads to that mode
 
 
 def _turned(R: Array) -> Array:
@@ -82,7 +84,7 @@ def _by_mode(m: TagSighting, config: AprilTagConfig, seen: TagsSeen, mode: TagMo
         raw=raw,
         cov=_turned(seen.R) @ mode.cov @ _turned(seen.R).T + np.diag(_TO_DECIDE**2),
         jacobian=jacobian,
-        # Edges are no matter where modes are chosen.
+        # How edges are seen does not matter for choosing a mode.
         slow_jacobian=slow_jacobian if seen.rides or seen.mounted or seen.timed else None,
         prior=mode.probability * (1.0 - config.false_fraction),
         size_m=float(np.hypot(raw[0], raw[1])),
@@ -135,7 +137,7 @@ def ideal(at: Attachment, config: AprilTagConfig) -> TagSighting:
         gtsam.Pose3(gtsam.Rot3(R_body_camera), t_body_camera)
     )
     docks = docks_of(survey) if at.slow_value is not None else []
-    R, p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation())
+    R, p = T_world_camera.rotation().matrix(), np.asarray(T_world_camera.translation()) + at.carried_m
     corners = np.array([(-0.2, -0.2, 4.1), (0.2, -0.2, 3.9), (0.2, 0.2, 3.9), (-0.2, 0.2, 4.1)])
     now = p + corners @ R.T
     moved = np.asarray(at.slow_value)[:6] if docks else np.zeros(6)

@@ -5,11 +5,11 @@
 
 v: velocity of body in world at the state; dv: its change until the measurement, by the IMU; c: the water's current, east and
 north, a first-order Gauss-Markov process (over ground: none); R: body in world; omega: body rate from the gyroscope, bias
-removed; l, M: sensor in body; S: selects the measured axes. Constants of the run, each where it is not known: s: scale error; o: how
-far from l it sits, in axes of M (of wheels: the place that does not slip sideways); psi: by how much it is turned.
-With a = R^T (v + dv - c), the derivatives of u are Q^T R^T by v, -Q^T R^T by c, and Q^T [a]_x by the body tangent theta of
-R <- R Exp(theta): of x that is zero where u is along it, and only y tells the heading to first order. Not handled: slip of
-wheels, other than as outliers; scales that differ between axes.
+removed; l, M: configured mount of the sensor in body; S: selects the measured axes. Constants of the run, estimated where they are not
+known: s: scale error; o: place of the sensor less l, axes of M (of wheels: of the point that does not slip sideways); psi: yaw of
+the sensor beyond M. With a = R^T (v + dv - c), the derivatives of u are Q^T R^T by v, -Q^T R^T by c, and Q^T [a]_x by the body tangent
+theta in R <- R Exp(theta). Where u is along x the row of x is zero there, so only y tells the heading, to first order. Not handled:
+slip of wheels, other than as outliers; scales that differ between axes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from graphloc.frames import Array, Datum, skew
 from graphloc.graph import Attachment, Hint, Residual, Sensor, SlowProcess
 from graphloc.measurements import BodyVelocity
 
-_CURRENT, _OFF, _TURNED = slice(1, 3), slice(3, 6), 6  # after the scale error, in a slow state that has all
+_CURRENT, _OFF, _TURNED = slice(1, 3), slice(3, 6), 6  # rows of a slow state that has all, after the scale error
 _Z = skew(np.array([0.0, 0.0, 1.0]))
 
 
@@ -35,7 +35,7 @@ def _there(config: BodyVelocityConfig) -> NDArray[np.bool_]:
 
 
 def _slow_value(at: Attachment, config: BodyVelocityConfig) -> Array:
-    """Return scale error, current, m/s, how far off it sits, m, and is turned, rad, (7,); zero where they are not modelled."""
+    """Return (7,) scale error s, current c, m/s (2), place o, m (3), and yaw psi, rad; zero where they are not modelled."""
     full = np.zeros(7)
     if at.slow_value is not None:
         full[_there(config)] = at.slow_value

@@ -4,15 +4,15 @@
     z = y + A + B sin(h) + C cos(h) + D sin(2h) + E cos(2h) + e + w,   w ~ N(0, s^2)
     y = yaw(R_world_body R_body_sensor) - c,   h = 90 deg - y: heading of the sensor's own x axis, clockwise from north
 
-c: convergence, by which north where the vessel is lies counter-clockwise of the datum's (`Datum.convergence_rad`), by the estimate.
-A: mount offset. B to E: deviation by the vessel's iron, as in navigation (A. Smith's coefficients; east is positive), constants
-of the run. e: wander, a first-order Gauss-Markov process, of what passes: a crane, a quay of sheet piles, the compass's filter.
-Modelled as noise instead, deviation or wander of some degrees bends the heading by half of it, since ten readings per second
-seem certain, and true aerial matches are rejected.
+c: meridian convergence at the estimated place: by how much north there lies counter-clockwise of the datum's north
+(`Datum.convergence_rad`). A: mount offset. B to E: deviation by the vessel's iron, as in navigation (A. Smith's coefficients; east is
+positive); A to E are constants of the run. e: wander, a first-order Gauss-Markov process, by a crane or a quay of sheet piles that
+the vessel passes, or by the compass's own filter. If deviation or wander of some degrees are taken for white noise, ten readings per
+second seem certain: the heading is wrong by half of them, and true aerial matches are rejected.
 
-yaw(R) = atan2(R10, R00). With R <- R Exp(theta), d yaw / d theta is worked out in `_yaw_jacobian`. GTSAM has no factor of yaw
-and offset, so this one is relinearised at every pass (`graphloc.linear`): yaw is nearly linear in the correction (0.02 deg at
-3 deg of roll and pitch and 5 deg of correction). Not handled: pitch near +-90 deg.
+yaw(R) = atan2(R10, R00); its derivative by theta in R <- R Exp(theta): `_yaw_jacobian`. GTSAM has no factor of yaw and offset, so
+this one is linearised at every pass (`graphloc.linear`). Yaw is nearly linear in a correction: at 3 deg of roll and pitch, one of
+5 deg is wrong by 0.02 deg. Not handled: pitch near +-90 deg.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ def _yaw_jacobian(R: Array, x_body: Array, x_world: Array) -> Array:
     """Return the derivative (6,) of yaw(R Exp(theta) R_state_sensor) by the body tangent (theta, rho).
 
     Args:
-        R: (3, 3) body in world. x_body, x_world: (3,) the sensor's x axis.
+        R: (3, 3) body in world. x_body, x_world: (3,) x axis of the sensor, in body and in world.
     """
-    # d(R Exp(theta) x)/d theta = -R [x]_x, of which a row r of R gives x x r; yaw = atan2(y, x)
+    # d(R Exp(theta) x) / d theta = -R [x]_x: for a row r of R the cross product x x r. yaw = atan2(y, x).
     horizontal = x_world[0] ** 2 + x_world[1] ** 2
     jacobian = np.zeros(6)
     jacobian[:3] = skew(x_body) @ ((x_world[0] * R[1] - x_world[1] * R[0]) / horizontal)
@@ -64,8 +64,8 @@ def _axis(at: Attachment) -> tuple[Array, Array, Array]:
 
 
 def _yaw(at: Attachment, x_world: Array) -> float:
-    """Return y, rad; `x_world`: of the sensor (3,)."""
-    return math.atan2(x_world[1], x_world[0]) - float(at.datum.convergence_rad(at.T_world_body.translation()))
+    """Return y, rad, of the module's docstring; `x_world`: (3,) x axis of the sensor in world."""
+    return math.atan2(x_world[1], x_world[0]) - float(at.datum.convergence_rad(at.body_m))
 
 
 def _read(at: Attachment, config: CompassConfig, yaw: float) -> tuple[float, Array]:

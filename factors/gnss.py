@@ -3,16 +3,16 @@
 
     z = p + R (l + o) + u tau + d + w,   w ~ N(0, C + W),   d: first-order Gauss-Markov per axis
 
-z: fix in world; p, R: body in world; l: antenna in body (carried, see `Attachment`); o: how far from there it sits, a constant of
-the run, where that is not known; u: velocity of the antenna; tau: how much later than stamped the fix was measured (negative: it is
-stamped late), a constant of the run; C: the reported covariance; W: what d walks between its nodes (`Attachment.slow_walk`). The slow
-state holds n = -d.
+z: fix in world; p, R: body in world; l: configured place of the antenna in body (carried, see `Attachment`); u: its velocity;
+C: the reported covariance; W: what d walks between its nodes (`Attachment.slow_walk`). Constants of the run, estimated where they are
+not known: o: place of the antenna less l; tau: time of measurement less the stamp (negative: the stamp is late). The slow state
+holds n = -d.
 
-Without a slow state, o and tau: `GPSFactorArm`. With them: one linear factor, written anew at every pass. A solver that goes on from
-older linearisations (online) would need it written anew whenever the pose turns; there, without o and tau, native factors turn along:
-`A = p + R l` is a leaf (`ReferenceFrameFactor`, tied within 5 mm), and `A - N = z` is a `BetweenFactor` under the kernel. These
-leaves are 45 % of the variables where each state has a fix. Not handled: correlation between axes of d; of tau what u changes by
-in that time, and that it tells of the velocity.
+Without a slow state, o and tau the factor is `GPSFactorArm`. With any of them it is one linear factor, written anew at every pass. A
+solver that keeps older linearisations (online) would have to write that anew whenever the pose turns. There, without o and tau, native
+factors turn with the pose: the antenna `A = p + R l` is a variable of its own (a leaf: `ReferenceFrameFactor`, tied within 5 mm), and
+`A - N = z` is a `BetweenFactor` with the kernel. These leaves are 45 % of the variables where each state has a fix. Not handled:
+correlation between the axes of d; change of u within tau; what a delayed fix tells of the velocity.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from graphloc.graph import (
 from graphloc.measurements import GnssPosition, world_from_fixes
 
 _TIE_M = 0.005  # how exactly leaf and lever arm follow the pose; far below any GNSS noise
-_LOST_S = 2.0  # without RTK fixes; then ambiguities are resolved anew, rightly or wrongly
+_LOST_S = 2.0  # without RTK fixes, after which the receiver resolves its ambiguities anew, rightly or wrongly
 _TIE = gtsam.noiseModel.Isotropic.Sigma(3, _TIE_M)
 
 
@@ -49,7 +49,7 @@ def white_covariance(m: GnssPosition, config: GnssConfig) -> Array:
     return with_floors(m.cov_enu_m2 * config.sigma_scale**2, np.array([horizontal, horizontal, vertical]))
 
 
-# A fix is asked for its place at every pass; remembered for as long as the fix itself is, however long a vessel is out.
+# Places of fixes, which every pass asks for. They are kept as long as the fix itself, so that memory does not grow with the run.
 _PLACES: WeakKeyDictionary[GnssPosition, tuple[Datum, Array]] = WeakKeyDictionary()
 
 
@@ -66,9 +66,9 @@ def _fix_world_m(m: GnssPosition, at: Attachment) -> Array:
 
 
 def _predicted_m(at: Attachment, config: GnssConfig) -> Array:
-    """The fix (3,) without white noise, in world."""
+    """Return the predicted fix (3,), without white noise, in world."""
     late, off = late_and_off(at, config)
-    place = at.T_world_body.transformFrom(at.T_state_sensor.transformFrom(off))
+    place = at.sensor_m(off)
     if at.slow_value is not None:
         place = place - at.slow_value
     if late:
@@ -111,7 +111,7 @@ def factors(m: GnssPosition, config: GnssConfig, at: Attachment, decision: Decis
     """Return the native factors of one fix; None where the linear one serves better."""
     if at.constants or (at.slow_key is not None and at.T_solver is None):
         return None
-    z = _fix_world_m(m, at)
+    z = _fix_world_m(m, at) - at.carried_m
     lever = np.asarray(at.T_state_sensor.translation())
     model = noise_model(white_covariance(m, config) + at.walked(), decision)
     if at.slow_key is None:

@@ -3,10 +3,10 @@
 
     z = (p + R l)_up + d^2 / 2 R_earth - t + w,   w ~ N(0, s^2)
 
-p, R: state in world; l: body origin from it; d: horizontal distance from the datum, since the sea falls below its tangent plane
-(2 m at 5 km), taken from the estimate at every pass; t: rise of the vessel by tide and load, and what the fixes' median is off by
-where it stands for the height, a slow state. Modelled as noise, a tide of 0.2 m is contradicted 120 times in two minutes, and
-biases the height that tags on a quay give. Without t: a native `GPSFactorArm` whose horizontal sigmas are 1 km.
+p, R: state in world; l: body origin seen from the state; d: horizontal distance from the datum, taken from the estimate at every
+pass, as the sea falls below the datum's tangent plane (2 m at 5 km); t: a slow state: rise of the vessel by tide and load, and the error
+of the configured height, or of the fixes' median that stands for it. Modelled as noise, a tide of 0.2 m is contradicted 120 times in
+two minutes, and biases the height that tags on a quay give. Without t: a native `GPSFactorArm` whose horizontal sigmas are 1 km.
 """
 
 from __future__ import annotations
@@ -34,13 +34,12 @@ def _fall_m(p_world_m: Array) -> float:
 
 def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Residual, ...]:
     """Return predicted - expected (1,), m."""
-    lever = np.asarray(at.T_state_sensor.translation())
-    point = at.T_world_body.transformFrom(lever)
+    point = at.sensor_m()
     tide = 0.0 if at.slow_value is None else float(at.slow_value[0])
     raw = np.array([point[2] + _fall_m(point) - tide - m.height_m])
 
     def jacobian() -> Array:
-        up = at.T_world_body.rotation().matrix()[2]
+        up, lever = at.T_world_body.rotation().matrix()[2], np.asarray(at.T_state_sensor.translation())
         return np.concatenate([skew(lever) @ up, up])[None, :]
 
     return (
@@ -63,21 +62,22 @@ def factors(m: HeightPrior, config: HeightConfig, at: Attachment, decision: Deci
     sigmas = np.array([_WIDE_M, _WIDE_M, m.sigma_m / np.sqrt(decision.weight)])
     model = robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas), decision.kernel)
     lever = np.asarray(at.T_state_sensor.translation())
-    target = np.array(at.T_world_body.transformFrom(lever))
+    target = at.sensor_m()
     target[2] = m.height_m - _fall_m(target)
+    target -= at.carried_m
     return GraphUpdate(factors=(gtsam.GPSFactorArm(at.pose_key, target, lever, model),))
 
 
 def ideal(at: Attachment, config: HeightConfig) -> HeightPrior:
     """Return the noise-free height at the attachment's state."""
-    point = at.T_world_body.transformFrom(at.T_state_sensor.translation())
+    point = at.sensor_m()
     tide = 0.0 if at.slow_value is None else float(at.slow_value[0])
     height_m = float(point[2]) + _fall_m(point) - tide
     return HeightPrior(stamp_ns=0, sensor="height", seq=0, height_m=height_m, sigma_m=config.sigma_m)
 
 
 def slow(config: HeightConfig) -> SlowProcess | None:
-    """Return the rise by tide and load, and what the configured height is off by; None if nothing of that is modelled."""
+    """Return the process of tide, load and the error of the configured height (t); None if it is not modelled."""
     if config.offset_sigma_m == 0.0:
         return None
     return SlowProcess(

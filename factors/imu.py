@@ -20,7 +20,7 @@ which preserves the bias and a steady turn. The specific force is treated likewi
 average it supports the vessel. (w_m - b_g) x v replaces the mean, v: velocity in body axes when the gap began, so the vessel
 continues in the direction of its bow. Integrated with gravity, an unknown roll would become an acceleration (250 m after 13 s),
 but vessels stay upright: over a gap, roll and pitch wander no more than in one second. Bias and velocity are the values known
-when a link is made (`graphloc.graph.Going`) and are not estimated by it: preintegration needs its samples before the velocity
+when a link is made (`graphloc.inertial.GapMotion`) and are not estimated by it: preintegration needs its samples before the velocity
 is known.
 """
 
@@ -36,23 +36,24 @@ from numpy.typing import NDArray
 from graphloc import keys
 from graphloc.config import ImuConfig
 from graphloc.frames import Array
-from graphloc.graph import Going
+from graphloc.inertial import GapMotion
 from graphloc.measurements import ImuSeries
 from graphloc.signals.series import integral, interpolated
+from graphloc.time import duration_ns
 
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # white noise of unknown motion in a gap
 _SHORT_S = 2.0  # longest gap that is interpolated linearly; none is so short in which an IMU is switched off and on
 _ANEW = 0.25  # of the turn-on bias, by which it differs from one time to the next; a choice
 _FORGET_S, _AROUND_S = 1.0, 10.0  # decay of the last sample in a gap; length of the means on either side
-_LAID_MPS = 3.0  # of a vessel before its velocity is known
-_ASKEW_RAD = 0.1  # of the direction of what moves across a pause
+_LAID_MPS = 3.0  # 1 sigma, of a vessel whose velocity is not known yet
+_ASKEW_RAD = 0.1  # 1 sigma, of the direction of a motion across a pause
 _GAP_STEP_S = 0.1  # integration step across a gap
 _ABOUT_NS = 100_000_000  # to either side of a stamp: shorter than waves, longer than vibration
 _INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz)-like floor that keeps position covariance positive
 
 
 class Links:
-    """Preintegration of one IMU (see `graphloc.graph.InertialLink`)."""
+    """Preintegration of one IMU (see `graphloc.inertial.InertialLink`)."""
 
     def __init__(
         self, imu: ImuSeries, config: ImuConfig, R_body_imu: Array, gravity_mps2: float, noise_scale: float
@@ -61,7 +62,7 @@ class Links:
         self._samples = np.hstack([imu.accel_mps2, imu.gyro_radps])
         self._config = config
         self._R_body_imu = R_body_imu
-        self._max_gap_ns = int(config.max_gap_s * 1e9)
+        self._max_gap_ns = duration_ns(config.max_gap_s)
         self._noise_scale = noise_scale
         self._gravity_mps2 = gravity_mps2 if config.gravity != "removed" else 0.0
         gyro = config.gyro_noise_radps * noise_scale
@@ -81,20 +82,20 @@ class Links:
         self._silent += _silences(stamps[stamps >= newest[0]] if len(newest) else stamps)
 
     def leave_out(self, after_ns: int, until_ns: int) -> None:
-        """Drop the samples of an interval, of which the first of all is none; however short, it is a gap."""
+        """Drop the samples after one stamp until another, which is then a gap, however short. The very first sample is not among them."""
         kept = (self._stamps <= after_ns) | (self._stamps > until_ns)
         self._stamps, self._samples = self._stamps[kept], self._samples[kept]
         within = [gap for gap in self._left_out if after_ns <= gap[0] and gap[1] <= until_ns]
         self._left_out = [gap for gap in self._left_out if gap not in within] + [(after_ns, until_ns)]
 
     def pause(self, after_ns: int, until_ns: int) -> None:
-        """Allow for no time having passed between two samples: it is a gap then, however short."""
+        """Add noise between two samples, as if less time or none had passed between them; that is then a gap, however short."""
         self._pauses.append((after_ns, until_ns))
 
     def forget(self, before_ns: int) -> None:
-        """Drop the samples before a stamp except the last of them, and those that tell how a gap goes on."""
+        """Drop the samples before a stamp, except the last of them and those that the bridge of a gap after it needs."""
         self._left_out = [gap for gap in self._left_out if gap[1] >= before_ns]
-        before_ns = min([before_ns, *(a - int(_AROUND_S * 1e9) for a, _ in self._left_out)])
+        before_ns = min([before_ns, *(a - duration_ns(_AROUND_S) for a, _ in self._left_out)])
         first = max(int(np.searchsorted(self._stamps, before_ns)) - 1, 0)
         self._stamps, self._samples = self._stamps[first:].copy(), self._samples[first:].copy()
 
@@ -108,11 +109,11 @@ class Links:
         params.setBodyPSensor(gtsam.Pose3(gtsam.Rot3(self._R_body_imu), np.zeros(3)))
         return params
 
-    def integrate(self, start_ns: int, stop_ns: int, bias: Any, going: Going | None = None) -> Any:
+    def integrate(self, start_ns: int, stop_ns: int, bias: Any, going: GapMotion | None = None) -> Any:
         """Return the preintegrated measurement over [start_ns, stop_ns], in at least two steps.
 
         Args:
-            bias: `gtsam.imuBias.ConstantBias`. going: bias and velocity at the begin of a gap.
+            bias: `gtsam.imuBias.ConstantBias`. going: bias and velocity where a gap begins; None: `bias`, and at rest.
         """
         first = int(np.searchsorted(self._stamps, start_ns, side="right"))
         last = int(np.searchsorted(self._stamps, stop_ns, side="left"))
@@ -130,7 +131,7 @@ class Links:
         if gap is not None and gap[1] - gap[0] <= _SHORT_S * 1e9 and gap[1] <= self._stamps[-1]:
             params = self._make_params(self._gravity_mps2, _UNKNOWN_MPS2, np.full(3, _UNKNOWN_RADPS))
         elif gap is not None:
-            going = going or Going(bias, np.zeros(3))
+            going = going or GapMotion(bias, np.zeros(3))
             samples, bias = self._bridge(middles, samples, gap, going), going.bias
             params = self._gap_params(start_ns, stop_ns, gap)
         for pause in self._pauses:
@@ -152,7 +153,7 @@ class Links:
         return np.asarray(self._samples[right - 1] * (1.0 - share) + self._samples[right] * share)
 
     def _gap_of(self, start_ns: int, stop_ns: int) -> tuple[int, int] | None:
-        """Return the longest gap (start, stop) that overlaps an interval, if any; the time after the last sample is one too."""
+        """Return the longest gap (start, stop) that overlaps an interval, or None. The time after the last sample is a gap, too."""
         for after_ns, until_ns in self._left_out:
             if after_ns < stop_ns and start_ns < until_ns:
                 return self._around(after_ns, until_ns)
@@ -170,13 +171,17 @@ class Links:
         return int(stamps[n]), int(stamps[n + 1])
 
     def _around(self, after_ns: int, until_ns: int) -> tuple[int, int]:
-        """Return the samples (stamps) around an interval without any; where none follows it, its end."""
+        """Return the stamps of the samples before and after an interval that has none; where none follows it, its end."""
         left, right = np.searchsorted(self._stamps, [after_ns, until_ns], side="right")
         before_ns = min(int(self._stamps[max(left - 1, 0)]), after_ns)
         return before_ns, int(self._stamps[right]) if right < len(self._stamps) else until_ns
 
-    def _bridge(self, stamps_ns: NDArray[np.int64], samples: Array, gap: tuple[int, int], going: Going) -> Array:
-        """Return samples (M, 6) for an interval with a gap, to be integrated without gravity."""
+    def _bridge(self, stamps_ns: NDArray[np.int64], samples: Array, gap: tuple[int, int], going: GapMotion) -> Array:
+        """Return samples (M, 6), at stamps (M,), of an interval with a gap, to be integrated without gravity (see the module's docstring).
+
+        Args:
+            samples: (M, 6) those outside the gap. gap: its begin and end, stamps.
+        """
         start_ns, stop_ns = gap
         mean_before, mean_after = self._means_around(start_ns, stop_ns)
         length, t = (stop_ns - start_ns) * 1e-9 / _FORGET_S, (stamps_ns - start_ns)[:, None] * 1e-9 / _FORGET_S
@@ -210,10 +215,11 @@ class Links:
         tilt = np.hypot(white, _UNKNOWN_RADPS * np.sqrt(share / ((stop_ns - start_ns) * 1e-9)))
         return self._make_params(0.0, _UNKNOWN_MPS2, np.array([tilt, tilt, _UNKNOWN_RADPS]))
 
-    def _paused(self, params: Any, pause: tuple[int, int], share: float, going: Going | None) -> Any:
-        """Return the parameters of an interval, a share of which lies in a pause: it may be that no time passed, and nothing moved.
+    def _paused(self, params: Any, pause: tuple[int, int], share: float, going: GapMotion | None) -> Any:
+        """Return the parameters of an interval, a share of which lies in a pause, in which perhaps no time passed and nothing moved.
 
-        Over the whole of a pause g that is worth v g, w g and (f - f_m) g, 1 sigma; f_m: the mean force around it, as that is gravity.
+        The motion over a whole pause of length g is then wrong by v g, w g and (f - f_m) g, which is taken as 1 sigma; f_m: the mean
+        specific force around the pause, which is mostly gravity.
         """
         moved = _squared(going.v_body_mps) if going else _LAID_MPS**2 * np.eye(3)
         bias = going.bias if going else gtsam.imuBias.ConstantBias()
@@ -230,7 +236,7 @@ class Links:
 
     def _means_around(self, start_ns: int, stop_ns: int) -> tuple[Array, Array]:
         """Return the means (6,) of the seconds before and after a gap; a side with too few samples takes the mean of the other."""
-        around_ns = int(_AROUND_S * 1e9)
+        around_ns = duration_ns(_AROUND_S)
         first, start, stop, last = np.searchsorted(
             self._stamps, [start_ns - around_ns, start_ns + 1, stop_ns, stop_ns + around_ns]
         )
@@ -332,7 +338,7 @@ def _silences(stamps_ns: NDArray[np.int64]) -> list[tuple[int, int]]:
 
 
 def _squared(v: Array) -> Array:
-    """Return the covariance (3, 3) of what is v (3,) or nothing, whose direction is known to `_ASKEW_RAD` when a link is made."""
+    """Return the covariance (3, 3) of an error that is v (3,) or zero, where the direction of v is known to `_ASKEW_RAD`."""
     return np.asarray(np.outer(v, v) + _ASKEW_RAD**2 * float(v @ v) * np.eye(3))
 
 

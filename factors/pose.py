@@ -4,15 +4,15 @@
 The measured axes replace those of the current estimate of the sensor's pose; the result, moved to the
 body, anchors a native `PriorFactorPose3` whose unmeasured axes are wide:
 
-    Z = T_world_sensor(measured axes) ;  anchor = Z T_state_sensor^-1 ;  e = Log(anchor^-1 T_world_body)
+    Z = T_world_sensor(measured axes), less `Attachment.carried_m` ;  anchor = Z T_state_sensor^-1 ;  e = Log(anchor^-1 T_world_body)
 
-Exact when re-anchored (measured: anchored level it is 11 % wrong at 3 deg of roll and pitch), which
-the solver does every pass. Rotation errors are small rotations about the world's axes, as in ROS.
+That is exact where the anchor has the roll and pitch of the estimate, so the solver makes the factor anew at every pass (with a level
+anchor it is 11 % wrong at 3 deg of roll and pitch). Rotation errors are small rotations about the world's axes, as in ROS.
 Each mode is a hypothesis, and so is 'none of them'; the solver weighs them. Not handled: pitch near
 +-90 deg where roll and yaw are measured alone.
 
-An error d that poses share for a while (`PoseConfig.slow_error`; first-order Gauss-Markov, in x, y, z and yaw as measured) is added to
-what is predicted, `e = Log(anchor^-1 T_world_body) + d`; the factor then has two states, and is relinearised at every pass
+Poses may share an error d for a while (`PoseConfig.slow_error`: first-order Gauss-Markov, in those of x, y, z and yaw that are measured).
+It is added to the prediction, `e = Log(anchor^-1 T_world_body) + d`; the factor then has two states, and is linearised at every pass
 (`graphloc.linear`).
 """
 
@@ -43,6 +43,10 @@ def _covariance(mode: PoseMode, axes: tuple[str, ...], config: AnyPoseConfig) ->
     return with_floors(scale[:, None] * mode.cov * scale, floors**2)
 
 
+def _sensor_pose(at: Attachment) -> Any:
+    return gtsam.Pose3(at.T_world_body.rotation().compose(at.T_state_sensor.rotation()), at.sensor_m())
+
+
 def _measured_sensor_pose(mode: PoseMode, axes: tuple[str, ...], T_world_sensor: Any) -> Any:
     """Return T_world_sensor with the measured axes replaced."""
     values = np.concatenate([T_world_sensor.translation(), T_world_sensor.rotation().rpy()])
@@ -52,8 +56,8 @@ def _measured_sensor_pose(mode: PoseMode, axes: tuple[str, ...], T_world_sensor:
 
 
 def without_slow(m: PoseFix, config: AnyPoseConfig, at: Attachment) -> tuple[Residual, ...]:
-    """Return predicted - measured (k,), m and rad, for each mode, as if nothing slow were added to what is measured."""
-    T_world_sensor = at.T_world_body.compose(at.T_state_sensor)
+    """Return predicted - measured (k,), m and rad, for each mode, without a slow state."""
+    T_world_sensor = _sensor_pose(at)
     R = T_world_sensor.rotation().matrix()
     picked = [AXES.index(a) for a in m.axes]
     world = _world_jacobian(R, at.T_state_sensor)
@@ -91,10 +95,11 @@ def _size_deg(raw: Array, axes: tuple[str, ...]) -> float | None:
 
 
 def with_slow(plain: Residual, axes: tuple[str, ...], value: Array, shown: Array, by_pose: Array) -> Residual:
-    """Return a residual with what a slow state adds to it.
+    """Return a residual to which a slow state is added.
 
     Args:
-        value: (n,) of the slow state. shown: (k, n) d raw / d (slow state). by_pose: (k, 6) d raw / d (body tangent of the state's pose), with what the slow state does.
+        value: (n,) of the slow state. shown: (k, n) d raw / d (slow state).
+        by_pose: (k, 6) d raw / d (body tangent of the state's pose), slow state included.
     """
     raw = plain.raw + shown @ value
     return replace(
@@ -169,7 +174,7 @@ def factors(m: PoseFix, config: AnyPoseConfig, at: Attachment, decision: Decisio
     if at.slow_key is not None:
         return None
     mode = m.modes[decision.mode]
-    T_world_sensor = at.T_world_body.compose(at.T_state_sensor)
+    T_world_sensor = _sensor_pose(at)
     Z = _measured_sensor_pose(mode, m.axes, T_world_sensor)
     # Whitened rows of d(world translation, world rotation of the sensor) / d(body tangent). Built as a
     # square root: inverting a covariance with 1 km and 0.1 deg in it leaves spurious information behind,
@@ -179,7 +184,7 @@ def factors(m: PoseFix, config: AnyPoseConfig, at: Attachment, decision: Decisio
     root = np.diag([1.0 / _WIDE_M] * 3 + [1.0 / _WIDE_RAD] * 3)
     cov = _covariance(mode, m.axes, config) / decision.weight
     root[np.ix_(picked, picked)] = gauss.whitening(cov)
-    anchor = Z.compose(at.T_state_sensor.inverse())
+    anchor = gtsam.Pose3(Z.rotation(), Z.translation() - at.carried_m).compose(at.T_state_sensor.inverse())
     upper = np.linalg.qr(root @ rows)[1]
     upper *= np.sign(np.diagonal(upper))[:, None]  # GTSAM takes a diagonal one for sigmas, and these are positive
     base = gtsam.noiseModel.Gaussian.SqrtInformation(upper)
@@ -193,8 +198,8 @@ def _world_jacobian(R_world_sensor: Array, T_state_sensor: Any) -> Array:
 
 
 def ideal_without_slow(at: Attachment, config: AnyPoseConfig) -> PoseFix:
-    """Return the noise-free pose at the attachment's state, as if nothing slow were added to it."""
-    T = at.T_world_body.compose(at.T_state_sensor)
+    """Return the noise-free pose at the attachment's state, without a slow state."""
+    T = _sensor_pose(at)
     values = np.concatenate([T.translation(), T.rotation().rpy()])
     sigmas = np.where(np.arange(6) < 3, 0.3, np.radians(2.0))
     picked = [AXES.index(a) for a in config.axes]
@@ -203,7 +208,7 @@ def ideal_without_slow(at: Attachment, config: AnyPoseConfig) -> PoseFix:
 
 
 def moved(ideal: PoseFix, by: Array) -> PoseFix:
-    """Return a pose of one mode, its value (k,) moved by something slow."""
+    """Return a pose of one mode, its value (k,) moved by that of a slow state."""
     (mode,) = ideal.modes
     return replace(ideal, modes=(replace(mode, value=mode.value + by),))
 
@@ -226,7 +231,7 @@ def hint(m: PoseFix, mount_yaw_rad: float, datum: Datum) -> Hint:
 
 
 def scaled(m: PoseFix) -> dict[str, list[int]]:
-    """Return which axes each factor of the configuration scales."""
+    """Return the keys of the configuration that scale sigmas, each with the axes (numbers) that it scales."""
     long = [k for k, axis in enumerate(m.axes) if AXES.index(axis) < 3]
     return {"sigma_scale": long, "angle_sigma_scale": [k for k in range(len(m.axes)) if k not in long]}
 

@@ -4,14 +4,15 @@
     z = L' (v + dv + R (omega x (l + o)) + a tau) + d + w,   w ~ N(0, C + W),   d: first-order Gauss-Markov per axis
     a = R (f + alpha x (l + o) + omega x (omega x (l + o))) + g
 
-L: from east, north, up where the vessel is to world (`Datum.local_axes`); v: velocity of body in world at the state; dv: its change until the measurement, by the IMU; omega: body rate from the gyroscope,
-bias removed; l: antenna in body; o: how far from there it sits, a constant of the run, where that is not known; a: acceleration of
-the antenna, by the specific force f and the change alpha of the body rate; tau: how much later than stamped it was measured
-(negative: stamped late), a constant of the run, where that is not known; W: what d walks between its nodes (`Attachment.slow_walk`).
-The slow state holds n = -d, as that of `gnss`. d z / d v = L',
-d z / d theta = -L' R [omega x (l + o) + (f + ...) tau]_x. The lever-arm term carries information: in waves it shows the heading. With R fixed at the
-estimate in it, passes converged slowly (not after 6). dv and omega are taken from the estimate at every pass; dv within half a period
-of the states turns by 9 mm/s for 1 deg of attitude. Not handled: of tau what a changes by in that time.
+L: rotation from east, north, up where the vessel is to world (`Datum.local_axes`); v: velocity of body in world at the state; dv: its
+change until the measurement, by the IMU; omega: body rate from the gyroscope, bias removed; l: configured place of the antenna in body;
+a: its acceleration, by the specific force f and the angular acceleration alpha; W: what d walks between its nodes
+(`Attachment.slow_walk`). Constants of the run, estimated where they are not known: o: place of the antenna less l; tau: time of
+measurement less the stamp (negative: the stamp is late). The slow state holds n = -d, as that of `gnss`.
+
+d z / d v = L',  d z / d theta = -L' R [omega x (l + o) + (f + ...) tau]_x. The lever-arm term carries information: in waves it shows
+the heading. With R in it fixed at the estimate, passes converged slowly (not after 6). dv and omega are taken from the estimate at every
+pass; within half a period of the states, dv turns by 9 mm/s for 1 deg of attitude. Not handled: change of a within tau.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from graphloc.measurements import GnssVelocity
 
 def _to_local(at: Attachment) -> Array:
     """L' (3, 3)."""
-    return at.datum.local_axes(at.T_world_body.translation()).T
+    return at.datum.local_axes(at.body_m).T
 
 
 def _predicted_mps(at: Attachment, config: VelocityConfig) -> Array:
-    """The velocity (3,) without noise: east, north, up."""
+    """Return the predicted velocity (3,), without white noise: east, north, up."""
     late, off = late_and_off(at, config)
     v = at.sensor_velocity_mps(off)
     if late:
@@ -42,7 +43,7 @@ def _predicted_mps(at: Attachment, config: VelocityConfig) -> Array:
 
 
 def _attitude_jacobian(at: Attachment, config: VelocityConfig) -> Array:
-    """Return the derivative (3, 6) of what R turns by the body tangent (theta, rho)."""
+    """Return d z / d (body tangent of the state's pose: theta, rho), (3, 6)."""
     late, off = late_and_off(at, config)
     turned = at.swing_mps(off) + (at.pushed_mps2(off) * late if late else 0.0)
     return np.hstack([-_to_local(at) @ at.T_world_body.rotation().matrix() @ skew(turned), np.zeros((3, 3))])
@@ -79,7 +80,7 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
 
 
 def slow(config: VelocityConfig) -> SlowProcess | None:
-    """Return the error that lasts for seconds; None if none is modelled."""
+    """Return the process of the velocity error that lasts for seconds (d); None if none is modelled."""
     if config.wander_sigma_mps == 0.0:
         return None
     return SlowProcess(

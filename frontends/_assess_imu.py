@@ -16,7 +16,7 @@ from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, wra
 from graphloc.frontends import _clock
 from graphloc.frontends._assess import Courses, MeasuredMotion, vec
 from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
-from graphloc.frontends._reports import CompassReport, ImuReport, MountGuess
+from graphloc.frontends._reports import CompassReport, ImuReport, MountGuess, Vec
 from graphloc.frontends._sanity import (
     HALF,
     NEVER_STILL_RADPS,
@@ -134,7 +134,7 @@ def _measured_mount(samples: _Samples, motions: Sequence[MeasuredMotion]) -> Mou
     if not aligned or off_deg < _SLIGHTLY_DEG:
         return _turned(samples, motions, level, said)
     mount = _turned(samples, motions, level, f"{said}, {off_deg:.0f} deg off")
-    turn = Rotation.from_euler("xyz", mount.rpy_deg, degrees=True).as_matrix() @ level.T
+    turn = rotation_from_rpy_deg(np.array(mount.rpy_deg)) @ level.T
     roll, pitch, yaw = np.degrees(rpy_from_rotation(turn @ _level(axis))).tolist()
     square = f"drafted in steps of 90 deg: if the sensor is tilted in the craft, rather than the craft itself, set [{roll:.1f}, {pitch:.1f}, {yaw:.1f}]"
     return replace(mount, evidence=f"{mount.evidence}; {square}")
@@ -153,6 +153,11 @@ def _in_place_of(pose: tuple[Array, Array], tilt_deg: float, mount: MountGuess) 
     return replace(mount, xyz_m=vec(pose[0]), evidence=why)
 
 
+def _rpy_deg(R: Array) -> Vec:
+    """Return roll, pitch and yaw in deg of a rotation (3, 3), to a tenth."""
+    return vec(np.round(np.degrees(rpy_from_rotation(R)), 1) + 0.0)  # + 0.0: no -0.0
+
+
 def _turned(samples: _Samples, motions: Sequence[MeasuredMotion], level: Array, said: str) -> MountGuess:
     """Return the mount of a sensor that `level` (3, 3) levels, aligned with the motion; `said`: why it is known."""
     yaw, sigma, evidence = _mount_yaw(samples.turned(level), motions)
@@ -162,7 +167,7 @@ def _turned(samples: _Samples, motions: Sequence[MeasuredMotion], level: Array, 
         yaw = float(np.degrees(np.arctan2(-ahead[1], ahead[0]))) + 0.0
         evidence += f": taken as {yaw:.0f}" + ("" if yaw == 0.0 else ", z ahead and y down as in a camera's axes")
     turn = Rotation.from_euler("z", yaw, degrees=True).as_matrix()
-    rpy = vec(np.round(np.degrees(rpy_from_rotation(turn @ level)), 1) + 0.0)
+    rpy = _rpy_deg(turn @ level)
     return MountGuess(rpy_deg=rpy, tf_frame=None, evidence=f"{said}; {evidence}", yaw_told=told, yaw_sigma_deg=sigma)
 
 
@@ -180,7 +185,7 @@ def turned_as_its_heading(imu: ImuReport, compasses: Sequence[CompassReport]) ->
     if quarters == 0:
         return imu
     turn = Rotation.from_euler("z", 90.0 * quarters, degrees=True).as_matrix()
-    rpy = vec(np.round(np.degrees(rpy_from_rotation(turn @ R)), 1) + 0.0)
+    rpy = _rpy_deg(turn @ R)
     turned = "half a turn" if quarters == 2 else "a quarter turn"
     said = f"{imu.mount.evidence}, but {turned} off that, as its orientation is {own.offset_deg:+.0f} deg off the GNSS course"
     return replace(imu, mount=replace(imu.mount, rpy_deg=rpy, evidence=said, yaw_told=True))
@@ -201,7 +206,7 @@ def turned_as_headed(
     if yaw is None:
         return report
     R = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ rotation_from_rpy_deg(np.array(report.mount.rpy_deg))
-    rpy = vec(np.round(np.degrees(rpy_from_rotation(R)), 1) + 0.0)
+    rpy = _rpy_deg(R)
     told = f"{report.mount.evidence}; but from there {said}"
     return replace(report, mount=replace(report.mount, rpy_deg=rpy, evidence=told, yaw_told=True, yaw_sigma_deg=sigma))
 
@@ -283,7 +288,7 @@ def _turning_of(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> Tur
 def _in_body(series: ImuSeries, report: ImuReport, evidence: ImuEvidence) -> tuple[NDArray[np.int64], Array, Array]:
     """Return stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the vessel, without the gyro bias, if known."""
     known = evidence.pose_of(report.mount.tf_frame)
-    R = known[1] if known else Rotation.from_euler("xyz", report.mount.rpy_deg, degrees=True).as_matrix()
+    R = known[1] if known else rotation_from_rpy_deg(np.array(report.mount.rpy_deg))
     unbiased = series.gyro_radps - (report.gyro_bias_radps or (0.0, 0.0, 0.0))
     return series.stamps_ns, series.accel_mps2 @ R.T, unbiased @ R.T
 

@@ -227,10 +227,8 @@ def _error_lines(compass: CompassReport) -> list[str]:
     if wander > max(_WANDER_DEG, _LARGER * usual):
         usual, why = wander, "as it wanders beside the gyro; iron near it, or its own filter"
     if compass.drifts:
-        usual, why = (
-            max(_DRIFTS[0], usual),
-            "its north is its own, as without a magnetometer: it drifts; 0.5 if it is magnetic",
-        )
+        usual = max(_DRIFTS[0], usual)
+        why = "its north is its own, as without a magnetometer: it drifts; 0.5 if it is magnetic"
     lines.append(f"  wander_sigma_deg: {usual:.1f}  # guess: {why}")
     return [*lines, f"  wander_time_constant_s: {_DRIFTS[1]:.0f}  # guess: likewise"] if compass.drifts else lines
 

@@ -36,9 +36,8 @@ from graphloc.measurements import (
     Measurement,
     PoseFix,
 )
-from graphloc.signals.frozen_imu import WHY, frozen_imu_warning, frozen_samples
-from graphloc.signals.imu_spikes import WHY as SPIKE
-from graphloc.signals.imu_spikes import spike_warning, spikes
+from graphloc.signals.frozen_imu import FROZEN_IMU, frozen_imu_warning, frozen_samples
+from graphloc.signals.imu_spikes import IMU_SPIKE, spike_warning, spikes
 from graphloc.signals.thinning import THINNED, Thinning
 from graphloc.time import NS_PER_S, utc_text
 
@@ -233,11 +232,11 @@ def _drop_wrong(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
     stamps, values = readings.stamps(), _imu_values(readings)
     frozen = frozen_samples(stamps, values)
     warnings += frozen_imu_warning(readings.sensor, stamps, frozen)
-    rows = readings.drop(frozen, rejected(WHY))
+    rows = readings.drop(frozen, rejected(FROZEN_IMU))
     stamps, values = stamps[~frozen], values[~frozen]
     spiked = spikes(stamps, values)
     warnings += spike_warning(readings.sensor, stamps, spiked)
-    return rows + readings.drop(spiked, rejected(SPIKE))
+    return rows + readings.drop(spiked, rejected(IMU_SPIKE))
 
 
 def reject_repeats(readings: Readings) -> list[LedgerRow]:

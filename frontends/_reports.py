@@ -14,9 +14,9 @@ from graphloc.frontends.nmea import SPEEDS
 from graphloc.plain import plain
 
 Vec = tuple[float, float, float]
-# Of MAVROS, microstrain_inertial, robot_localization, xsens_mti: what an EKF makes of receiver and IMU.
 # HDT and THS of a GNSS receiver; topics of ublox_gps, septentrio_gnss_driver, mavros and their like.
 _TWO_ANTENNAS = re.compile(r"[ +]G[A-Z](HDT|THS)$|gps|gnss|nav_?heading|rel_?pos|dual|moving_?bas", re.IGNORECASE)
+# Of MAVROS, microstrain_inertial, robot_localization, xsens_mti: what an EKF makes of receiver and IMU.
 _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
 TURNED_DEG = 10.0
 """Off the course, from which a compass is taken for turned in the craft."""

@@ -59,10 +59,8 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
         return [f"{said}{other}; or the signs of {imu.sensor} are wrong (gravity: inverted)"]
     if not apart:
         return []
-    claimed, part = (
-        float(np.degrees(np.median([m.sigma_rad for m in headings]))),
-        float(np.degrees(rms(np.concatenate(apart)))),
-    )
+    claimed = float(np.degrees(np.median([m.sigma_rad for m in headings])))
+    part = float(np.degrees(rms(np.concatenate(apart))))
     if part < max(_PART_DEG, _PART * claimed):
         return []
     said = f"{sensor}: its headings differ by {part:.0f} deg (RMS) from the integrated gyro of {imu.sensor} but claim {claimed:.1f} deg: "

@@ -121,12 +121,10 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     imus, in_body = _in_axes_up(bag, gnss, _imu_reports(bag, evidence))
     best = _best_imu(bag, imus, evidence)
     compasses = compasses_of(bag, courses, best)
-    taken, imus = (
-        imus,
-        [turned_as_its_heading(imu, compasses) for imu in _beside_headings(bag, imus, evidence, compasses)],
-    )
-    if imus and imus[0] is not taken[0]:
-        best = _best_imu(bag, imus, evidence)
+    ranked = _beside_headings(bag, imus, evidence, compasses)
+    turned = [turned_as_its_heading(imu, compasses) for imu in ranked]
+    if turned and turned[0] is not imus[0]:
+        best = _best_imu(bag, turned, evidence)
     velocities = [(s, with_side(report, s, best.felt if best else None)) for s, report in velocities]
     late = motion_time_offsets(best.felt, bag.aligned[imus[0].topic], motions, bag.aligned) if best else {}
     timed = [timed_fixes(report, late, motions, velocities, bag.streams) for report in gnss]
@@ -137,9 +135,9 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     return Inspection(
         source=bag.source,
         topics=_topic_reports(bag),
-        imus=tuple(imus),
+        imus=tuple(turned),
         gnss=_with_wander(bag, timed, odometry, velocities, motions),
-        compasses=tuple(with_own_north(compass, imus) for compass in compasses),
+        compasses=tuple(with_own_north(compass, turned) for compass in compasses),
         odometry=tuple(reports),
         velocities=tuple(timed_velocity(report, late.get(report.topic), together) for _, report in velocities),
         lidars=lidars_of(bag),
@@ -147,7 +145,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
         tf_frames=bag.tree.frames,
         body_frame=bag.tree.body(),
         in_body=in_body,
-        warnings=(*bag.warnings, *_warnings(bag, gnss, imus, compasses, reports)),
+        warnings=(*bag.warnings, *_warnings(bag, gnss, turned, compasses, reports)),
     )
 
 
@@ -262,9 +260,11 @@ def _motions(
 
 
 def _imu_reports(bag: Contents, evidence: ImuEvidence) -> list[ImuReport]:
-    """Report the IMUs: whole ones with gravity in them first, of these any that feel how the craft moves, the least noisy ones first; of those about as noisy, one whose mount tf or the motion tells.
+    """Return the reports on the IMUs, the best one first.
 
-    One that feels nothing of what another one feels turns on its own: that of a stabilised camera.
+    In this order: those with rates and accelerations; with gravity in them; that feel how the craft moves (one that does not turns on
+    its own, as in a stabilised camera); that are about as quiet as the quietest of these; whose mount is known by tf; whose yaw is
+    known; the quietest.
     """
     imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, evidence))]
     moved = {imu.topic for imu in imus if len(imus) > 1 and feels_motion(bag.aligned[imu.topic], imu, evidence)}

@@ -49,7 +49,9 @@ def against_turning(turning: Turning | None, at_ns: NDArray[np.int64], angle: Ar
 
 
 def course_against_turning(turning: Turning, at_ns: NDArray[np.int64], course: Array) -> int:
-    """Return the same of a course: to half a turn, as it is where the craft goes astern, and if it turns by about as much as the craft does.
+    """Return +1 where a course turns to port as the craft does, -1 where it turns the other way, 0 where nothing tells.
+
+    It must turn by about as much as the craft. Turns are compared to half a turn, by which a course is off where the craft goes astern.
 
     Args:
         at_ns, course: as for `against_turning`.
@@ -62,7 +64,9 @@ def course_against_turning(turning: Turning, at_ns: NDArray[np.int64], course: A
 
 
 def left_of_turns(turning: Turning, at_ns: NDArray[np.int64], course: Array) -> float:
-    """Return what part of the changes of a course, to half a turn, a turning leaves, squared: 0 where it turns as the craft does; inf where nothing tells.
+    """Return the share of a course's squared changes that a turning does not explain: 0 where it turns as the craft; inf where nothing tells.
+
+    Changes are compared to half a turn, as in `course_against_turning`.
 
     Args:
         at_ns, course: as for `against_turning`.

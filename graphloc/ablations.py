@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run without each sensor in turn: what each bought, and which contradicts the others."""
+"""The run without each sensor in turn: what each contributes, and which contradicts the others."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from graphloc.solution import Solution
 log = logging.getLogger(__name__)
 _OPEN = "the remaining sensors do not determine position, height and heading over the whole run"
 _ONLY = "no other sensor tells the position"
-_VOTED = 3  # suspects that are set against each other, two by two
+_VOTED = 3  # most suspects that are left out two by two, too
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,11 +48,11 @@ def ablate(
 ) -> Ablated:
     """Smooth a run without each sensor in turn.
 
-    A sensor is left out as if it were switched off: what only it could tell from motion is then not modelled. Where
-    several contradict the rest, the run is smoothed without each two of them, to hear what is left.
+    A sensor is left out as if it were switched off: slow errors that only it could tell from motion are then not estimated. If
+    several sensors contradict the rest, the run is also smoothed without each two of them.
 
     Args:
-        hold_out: fixes to predict, where there is no truth. jobs: processes beside each other.
+        hold_out: fixes to predict, where there is no truth. jobs: number of parallel processes.
 
     Raises:
         InputError: no sensor has measurements.
@@ -104,7 +104,7 @@ def _solve(
 
 
 def _smoothed(job: _Job) -> Solution | str:
-    """Solve a run without some sensors; whatever that raises is a row that says why."""
+    """Solve a run without some sensors; any error becomes a row that says why."""
     off = {name: job.config.sensors[name].model_copy(update={"enabled": False}) for name in job.without}
     config = job.config.with_sensors(off)
     try:

@@ -10,8 +10,8 @@
               |----|           out = (sin f, cos f), right = (-cos f, sin f) for a face that looks along heading f:
               along            across = out . (p - P), along = right . (p - P), angle = heading - (f + 180 deg)
 
-A berth that has moved by (e, n, u) and turned by psi about c: p is first carried to where it would be with the berth at
-rest, p -> c + Rz(-psi) (p - c - (e, n, u)), and the yaw less psi. Roll and pitch of a dock are not handled.
+If the berth has moved by (e, n, u) and turned by psi about c, the vessel is first carried to where it would be with the berth at rest:
+p -> c + Rz(-psi) (p - c - (e, n, u)), yaw -> yaw - psi. Roll and pitch of a dock are not handled.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from graphloc.frames import Array, wrap_angle, yaw_from_heading_deg
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Berth:
-    """A point of a quay's face, and where that looks; both at rest.
+    """A point of a quay's face and the direction that the face looks, with the quay at rest.
 
     Attributes:
         name: for outputs. point_m: (3,) P in world. facing_deg: heading f, from north, clockwise.
-        pivot_m: (3,) c in world. moves: index of its (e, n, u, roll, pitch, psi) in the slow state of the
-            sensor that sees it; None: it stands still.
+        pivot_m: (3,) c in world. moves: index of the first of its (e, n, u, roll, pitch, psi) in the slow state of the sensor that sees
+            it; None: the quay does not move.
     """
 
     name: str
@@ -46,8 +46,8 @@ class BerthTrack:
     """A vessel seen from a berth, at N stamps.
 
     Attributes:
-        berth: which. stamps_ns: (N,). value: (N, 3) across m, along m, angle rad in (-pi, pi].
-        rate: (N, 3) of these, a second. cov: (N, 3, 3) of `value`, or None where it is not known.
+        berth: from which it is seen. stamps_ns: (N,). value: (N, 3) across m, along m, angle rad in (-pi, pi].
+        rate: (N, 3) of these, per s. cov: (N, 3, 3) of `value`, or None where it is not known.
     """
 
     berth: Berth

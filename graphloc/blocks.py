@@ -20,7 +20,7 @@ from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
 from graphloc.errors import ConfigError
 from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation
 
-_LEAST, _MOST = 1e-12, 1e12  # of any length, angle or time: squares and inverses of it are numbers, too
+_LEAST, _MOST = 1e-12, 1e12  # limits of any length, angle or time, so that its square and inverse are finite, too
 
 
 def _not_tiny(given: float) -> float:
@@ -36,7 +36,7 @@ Triple = tuple[Finite, Finite, Finite]
 
 
 _LONG = 40  # characters
-_MOST_SAID = 8  # things that are wrong with one file
+_MOST_SAID = 8  # errors that are listed of one file
 _MOST_BYTES, _MOST_VALUES = 10_000_000, 300_000  # a survey of 10 000 tags has 2 MB and 100 000 values
 _DEEPEST = 100
 _SHORT = reprlib.Repr()
@@ -71,13 +71,13 @@ class MountConfig(Block):
 
     @classmethod
     def of_pose(cls, t_body_sensor_m: Array, R_body_sensor: Array) -> MountConfig:
-        """Return it in numbers, as it is in no /tf_static."""
+        """Return the mount in numbers, without a frame of /tf_static."""
         xyz_m, rpy_deg = t_body_sensor_m, np.round(np.degrees(rpy_from_rotation(R_body_sensor)), 9) + 0.0  # no -0.0
         return cls(xyz_m=tuple(xyz_m.tolist()), rpy_deg=tuple(rpy_deg.tolist()))
 
 
 def nearest(key: str, known: list[str]) -> str:
-    """Return the known key that is meant by a wrong one, as the end of a message; and all of them, if they are few."""
+    """Return the end of a message on a wrong key: the known key that may be meant, and all known ones, if they are few."""
     close = difflib.get_close_matches(key, known, n=len(known) or 1, cutoff=0.4)
     best = max(
         close, key=lambda name: (difflib.SequenceMatcher(None, name, key).ratio(), name[:1] == key[:1]), default=""
@@ -119,7 +119,7 @@ def one_line(error: ValidationError, model: type[BaseModel], where: str, prefix:
 
 
 def _short(given: object) -> str:
-    """What somebody wrote, or what kind of thing that is where it is long: the rest of the line is what they must read."""
+    """Return a value as it was written, or only its kind where it is long, so that the rest of the line is read."""
     if isinstance(given, Mapping):
         return "a mapping"
     if isinstance(given, list | tuple):  # whose whole text may be larger than memory: aliases
@@ -151,7 +151,7 @@ def read_mapping(path: Path | Traversable, cure: str = "") -> Mapping[str, Any]:
         path: the file. cure: what to do where it cannot be read, for the message.
 
     Raises:
-        ConfigError: it cannot be read, or is something else.
+        ConfigError: it cannot be read, or its top level is no mapping.
     """
     try:
         with path.open("rb") as stream:
@@ -188,7 +188,7 @@ def _loaded(text: str) -> Any:
 
 
 def _values_in(node: object, known: dict[int, int]) -> int:
-    """How many values a tree has if aliases are written out; what several of them share is counted once, then known."""
+    """Return how many values a tree has with aliases written out; a node that several aliases share is walked through once."""
     if not isinstance(node, Mapping | list):
         return 1
     if id(node) not in known:

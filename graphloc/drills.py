@@ -105,7 +105,7 @@ class _Bench:
         return [_first_ns(tracks, part) for tracks, part in zip(self._normal, self._parts, strict=True)]
 
     def drill(self, cases: Sequence[Case]) -> tuple[list[dict[str, Times]], list[Measured]]:
-        """Return the errors over time of each estimator in each case, and what these amount to."""
+        """Return the errors over time of each estimator in each case, and the figures drawn from them."""
         recording, whole = self._run.recording, self._parts[0].whole
         origin_ns = self._parts[0].begin_ns if whole else int(_stamps(recording)[0])
         usual = [self._errors(tracks, k) for k, tracks in enumerate(self._normal)]
@@ -173,7 +173,7 @@ def _typical_bound_m(track: Trajectory) -> float:
 
 
 def _started_there(config: VesselConfig, recording: Recording, part: DrillWindow, track: Trajectory) -> VesselConfig:
-    """Return the configuration for a window; without a heading sensor, it starts with the heading of the run there."""
+    """Return the configuration for a window. Without a heading sensor it starts with the heading that the run has there."""
     told = any(isinstance(m, CompassHeading) for m in recording.measurements)
     at = np.array([max(part.begin_ns, int(track.stamps_ns[0]))])
     if part.whole or told or not track.covers(at)[0]:
@@ -189,7 +189,7 @@ def _tracks(job: _Job) -> Tracks:
         struck = job.case.failure.on(job.part, job.case.begin_ns, job.case.seed)
     recording, late_ns = struck.recording, struck.late_ns
     tracks: Tracks = {}
-    if job.case is None or recording is not job.part:  # what only comes late is nothing to the smoother
+    if job.case is None or recording is not job.part:  # the smoother does not see that something came late
         tracks["graphloc"] = _or_why_not(partial(_smoothed, recording, job))
     tracks["graphloc online"] = _or_why_not(partial(_replayed, recording, job, late_ns))
     known = as_it_comes(recording, late_ns)
@@ -218,7 +218,7 @@ def _or_why_not(solve: Callable[[], Trajectory]) -> tuple[Trajectory | None, str
 
 
 def as_it_comes(recording: Recording, late_ns: Mapping[int, int]) -> Recording:
-    """Return the recording as a filter without a model of delays sees it: late measurements stamped with their arrival."""
+    """Return the recording as filters get it, which do not model delays: late measurements are stamped with their arrival."""
     if not late_ns:
         return recording
     moved = [replace(m, stamp_ns=m.stamp_ns + late_ns.get(m.seq, 0)) for m in recording.measurements]

@@ -22,7 +22,7 @@ class GraphlocError(Exception):
 
 
 def in_one_line(error: BaseException) -> str:
-    """Return any error as one line; those that are not ours with their type."""
+    """Return an error as one line; with its type, if it is not a `GraphlocError`."""
     text = " ".join(str(error).split())
     return text if isinstance(error, GraphlocError) else f"{type(error).__name__}: {text}"
 
@@ -40,7 +40,7 @@ class SolveError(GraphlocError):
 
 
 def not_solved(what: str, error: Exception) -> SolveError:
-    """Return the error of a solver that gave up; where data can do that, its own words, of keys and options of GTSAM, go to the log."""
+    """Return the error of a solver that gave up. If data can cause it, GTSAM's own text, on keys and options, goes to the log only."""
     log.debug("%s: %s", what, error)
     if isinstance(error, MemoryError):
         return SolveError(f"{what}: no memory is left")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A pose now: what the online mode hands out."""
+"""What the online mode returns: an estimate of the newest state, and events."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from graphloc.trajectory import bounds_95
 
 
 class Event(NamedTuple):
-    """What happened under way.
+    """Something that happened during the run.
 
     Attributes:
-        text: a line. warns: it makes the track, or a sensor, doubtful, so that a reader must see it.
-        heading_guessed: from here on the heading is a guess, for as long as that is the cause of estimates' health.
+        text: a line. warns: whether a reader must see it, because it makes the track or a sensor doubtful.
+        heading_guessed: whether the heading is a guess from here on; it is one as long as the estimates' health says so
+            (`Cause.GUESSED_HEADING`).
     """
 
     text: str
@@ -29,14 +30,14 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Estimate:
-    """The body at one time, by what was known then, in two frames as REP 105 has them.
+    """The body at one time, by what was known then, in the two frames `map` and `odom` of REP 105.
 
     Attributes:
         stamp_ns: sensor time.
-        p_world_m, R_world_body, v_world_mps: (3,), (3, 3), (3,) in `map`: corrected, so it may jump.
+        p_world_m, R_world_body, v_world_mps: (3,), (3, 3), (3,) pose and velocity in `map` (world): corrected, so they may jump.
         cov: (6, 6) x, y, z (m) and small rotations (rad) about the world's axes. v_cov: (3, 3) of the velocity.
-        p_odom_m, R_odom_body: (3,), (3, 3) in `odom`: smooth, never corrected, so it drifts.
-        step_cov: (6, 6) of the odometry's step since the estimate before, as `cov`.
+        p_odom_m, R_odom_body: (3,), (3, 3) pose in `odom`: smooth and never corrected, so it drifts.
+        step_cov: (6, 6) of the step in `odom` since the estimate before, axes as of `cov`.
         gyro_radps: (3,) rate of the body, body axes, bias removed. gyro_cov: (3, 3) of it, rad^2/s^2.
         accel_bias_mps2, gyro_bias_radps: (3,) in IMU axes.
         health, reason: how far it can be trusted, and why not fully.
@@ -73,10 +74,10 @@ class Estimate:
 
     @property
     def bound_95_m(self) -> float:
-        """Radius that holds the horizontal position with 95 %: the long axis of its ellipse."""
+        """Radius of a circle that holds the horizontal position with at least 95 %: semi-major axis of the 95 % ellipse."""
         return float(bounds_95(self.cov[None])[0, 0])
 
     @property
     def heading_bound_95_rad(self) -> float:
-        """What holds the heading with 95 %."""
+        """Half width of the interval that holds the heading with 95 %."""
         return float(np.radians(bounds_95(self.cov[None])[0, 2]))

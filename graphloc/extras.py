@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is not in the package itself: optional parts, and what third parties add."""
+"""Optional parts of the package, and what other packages add to it."""
 
 from __future__ import annotations
 

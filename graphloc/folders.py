@@ -15,7 +15,7 @@ from graphloc.errors import OutputError
 
 
 def check_folder(folder: Path, *, overwrite: bool, mark: str) -> None:
-    """Refuse early what `fresh_folder` would refuse after the work.
+    """Refuse a folder that `fresh_folder` would refuse, before the work is done.
 
     A folder is replaced only if it holds the file `mark`, so that nobody's own work is.
 
@@ -35,7 +35,7 @@ def check_folder(folder: Path, *, overwrite: bool, mark: str) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Refuse what cannot be made at `path`, which need not be there, nor the folders that it lies in.
+    """Refuse a path at which nothing can be written. It need not exist, nor the folders that it lies in.
 
     Raises:
         OutputError: the nearest folder that is there may not be written to.

@@ -24,7 +24,7 @@ FILE = "tags.found.yaml"
 def about_tags(
     recording: Recording, config: VesselConfig, solution: Solution
 ) -> tuple[tuple[TagConfig, ...], list[str]]:
-    """Return tags that the run tells the place of, and what it says against the survey."""
+    """Return the tags that the run has located, and lines on these and on tags whose survey it contradicts."""
     said = suspect_tags(recording, config, solution)
     if not recording.tag_views:
         return (), said
@@ -49,7 +49,7 @@ def about_tags(
 
 
 def _riding(recording: Recording, surveys: Mapping[str, Survey], solution: Solution) -> dict[tuple[str, int], Riding]:
-    """How the docks moved that tags which are not surveyed seem to ride on."""
+    """Return how the docks moved on which unsurveyed tags seem to ride, by tag."""
     seen = recording.of(TagSighting)
     found = {}
     for tag, (sensor, frame) in only_beside(recording.tag_views, seen).items():

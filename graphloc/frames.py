@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 Array = NDArray[np.float64]
 
 EARTH_M = 6_371_000.0
-"""Radius of the sphere by which the ellipsoid falls and turns away from the datum's tangent plane: 0.3 % of that."""
+"""Radius of a sphere that stands for the ellipsoid where its curvature beneath the datum's tangent plane is needed: wrong by 0.3 % at most."""
 
 
 class Frame(NamedTuple):
@@ -89,19 +89,22 @@ class Datum:
         return np.column_stack([lat, lon, h])
 
     def convergence_rad(self, p_world_m: Array) -> Array:
-        """Return by how much true north at places (..., 3) in world lies counter-clockwise of north at the origin: 0.16 deg at 10 km east in latitude 60."""
+        """Return the meridian convergence (...) at places (..., 3) in world: by how much, counter-clockwise, true north there is off world y.
+
+        10 km east of the origin, in latitude 60, it is 0.16 deg.
+        """
         p = np.asarray(p_world_m, dtype=float)
         latitude_rad = np.radians(self.origin.latitude_deg) + p[..., 1] / EARTH_M
         return np.asarray(p[..., 0] * np.tan(latitude_rad) / EARTH_M)
 
     def local_axes(self, p_world_m: Array) -> Array:
-        """Return R (3, 3) from east, north, up of the ellipsoid at a place in world (3,) to the axes of world."""
+        """Return R (3, 3) from the axes east, north, up of the ellipsoid at a place (3,) in world to those of world."""
         east, north = np.asarray(p_world_m, dtype=float)[:2] / EARTH_M
         turn = skew(np.array([-north, east, float(self.convergence_rad(p_world_m))]))
         return np.asarray(np.eye(3) + turn + 0.5 * turn @ turn)
 
     def true_heading_deg(self, yaw_rad: Array | float, p_world_m: Array) -> Array:
-        """Return headings (...) from true north at the places (..., 3), clockwise in [0, 360) deg, of yaws (...) in world."""
+        """Return the headings (...), clockwise from true north, in [0, 360) deg, of yaws (...) in world at places (..., 3)."""
         return heading_deg_from_yaw(np.asarray(yaw_rad) - self.convergence_rad(p_world_m))
 
 
@@ -128,7 +131,7 @@ def wrap_angle(angle_rad: Array | float) -> Array:
 
 
 def continuous_longitudes(longitude_deg: Array) -> Array:
-    """Return longitudes (N,) about the first one, so that a run across the date line is continuous."""
+    """Return longitudes (N,) within 180 deg of the first one, so that a run across the date line is continuous."""
     return np.asarray(longitude_deg[0] + (longitude_deg - longitude_deg[0] + 180.0) % 360.0 - 180.0)
 
 
@@ -153,7 +156,7 @@ def yaw_from_rotation(rotation: Array) -> Array:
 
 
 def rpy_from_rotation(rotation: Array) -> Array:
-    """Return roll, pitch, yaw in rad, (3,) or (N, 3), of rotation matrices: the inverse of the above.
+    """Return roll, pitch, yaw in rad, (3,) or (N, 3), of rotation matrices: the inverse of `rotation_from_rpy_deg`, but for the unit.
 
     Where x points straight up or down only the sum of roll and yaw is told: yaw is zero there.
     """

@@ -3,7 +3,8 @@
 
 A row turns a measurement into residuals (to weigh it, choose its mode, write its ledger row, and make its factor of) and,
 where they serve better, into native GTSAM factors. Both functions are pure; what a row returns enters the graph whole or not
-at all. Builder and solvers know rows only through this module, never by name.
+at all. Builder and solvers know rows only through this module, never by name. The inertial sensor links states instead of measuring
+one: `graphloc.inertial`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from graphloc import gauss
 from graphloc.berths import Berth
 from graphloc.config import KernelConfig, SensorConfig
 from graphloc.frames import Array, Datum
-from graphloc.measurements import ImuSeries, Measurement
+from graphloc.measurements import Measurement
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -31,18 +32,18 @@ def _cross(a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class GraphUpdate:
-    """Factors and the guesses of the keys that only these factors introduce."""
+    """Factors, and initial values of the keys that no other factor has."""
 
     factors: tuple[Any, ...] = ()
     guesses: tuple[tuple[int, Any], ...] = ()
 
 
 class FeltMotion(NamedTuple):
-    """What an IMU feels about a stamp, biases removed.
+    """What an IMU measures about a stamp, biases removed.
 
     Attributes:
-        force_mps2: (3,) specific force. spin_radps2: (3,) change of the angular rate; both in the axes of the body at the state.
-        gravity_mps2: (3,) what is to be added to the force for an acceleration, world axes.
+        force_mps2: (3,) specific force, axes of the body at the state. spin_radps2: (3,) angular acceleration, the same axes.
+        gravity_mps2: (3,) gravity, world axes: an acceleration is the specific force, turned into world, plus this.
     """
 
     force_mps2: Array
@@ -54,30 +55,34 @@ class FeltMotion(NamedTuple):
 class Attachment:
     """Where a measurement meets the graph, and what the graph believes there now.
 
-    A measurement between two states is carried to the nearest one with the IMU's own relative motion:
-    `T_state_sensor` is the pose of the sensor at the measurement's stamp, seen from the body at the
-    state. Carrying is thus the same thing as a mount.
+    A measurement between two states belongs to the nearest one (in an IMU gap, to the one before it). The IMU measures the motion in
+    between. Its rotation is part of `T_state_sensor`, as if the sensor were mounted so, because it turns with the attitude at the state.
+    Its translation (`carried_m`) is not, because it does not turn with that attitude: as part of the mount it would hold the heading at the
+    present estimate (fixes of centimetres at 20 Hz, to some tenths of a degree).
 
     Attributes:
         pose_key, velocity_key: keys of the state.
-        slow_key: key of the sensor's slow state, or None.
+        slow_key: key of the sensor's slow state, at the slow node of the state; None where it has none.
         leaf_keys: two keys that belong to this measurement alone.
-        T_world_body: estimate at the state: body axes, origin at the IMU (see `graphloc.build`). v_world_mps: of its velocity (3,).
-        T_solver: where a solver that goes on from older linearisations linearises the pose (see `graphloc.linear`); None: at the
-            estimate, as all factors are written anew at every pass.
-        T_state_sensor: see above (gtsam.Pose3).
-        dv_world_mps: (3,) what velocity gains from the state to the measurement.
-        gyro_radps: (3,) body rate at the measurement, body axes, bias removed.
-        lever_m: (3,) sensor origin from the IMU, body axes.
-        slow_value: estimate of the slow state, or None.
-        slow_next: key and estimate of the next node of the slow state, how far from the one to the other the measurement
-            is (share), and how far apart they are in s; None where there is no next (yet).
-        slow_age_s: how long after its node the measurement is, at least 0.
-        slow_walk: (n,) variances: what a slow state that is held from node to node is off by, each measurement's share (see
-            `build.walk_between_nodes`); None: there is no slow state.
+        T_world_body: estimated pose of the state (gtsam.Pose3): axes of the body, origin at the IMU (see `graphloc.build`).
+        v_world_mps: (3,) its estimated velocity, world axes.
+        T_solver: pose (gtsam.Pose3) about which the solver linearises, where it keeps older linearisations (see `graphloc.linear`);
+            None: `T_world_body`, because all factors are written anew at every pass.
+        T_state_sensor: axes and lever arm of the sensor at the measurement's stamp, axes of the body at the state (gtsam.Pose3).
+        carried_m: (3,) way of the body from the state to the measurement, world axes, as estimated.
+        dv_world_mps: (3,) velocity at the measurement less that at the state, world axes.
+        gyro_radps: (3,) angular rate at the measurement, body axes, bias removed.
+        lever_m: (3,) origin of the sensor seen from the IMU, body axes.
+        slow_value: (n,) estimate of the slow state at `slow_key`, or None.
+        slow_next: of the node after that one: key and estimate (n,) of the slow state, share (0 to 1) of the time between both nodes
+            that has passed at the measurement, and that time in s; None where there is no such node (yet).
+        slow_age_s: time from the slow node to the measurement, at least 0.
+        slow_walk: (n,) variances to add to the measurement, because its slow error goes on changing between two nodes (see
+            `build.walk_between_nodes`) or its height is not used; None: nothing is added.
         constants: key and estimate of each of the sensor's constants.
+        own: for each constant, which of its components this sensor's measurements depend on (see `Constant.own`).
         datum: origin of world.
-        felt: what the IMU feels about the measurement; None where the delay of its stamp is not asked for.
+        felt: what the IMU measures about the measurement; None unless the delay of the sensor's stamps is estimated.
     """
 
     pose_key: int
@@ -87,6 +92,7 @@ class Attachment:
     T_world_body: Any
     v_world_mps: Array
     T_state_sensor: Any
+    carried_m: Array
     dv_world_mps: Array
     gyro_radps: Array
     lever_m: Array
@@ -101,25 +107,35 @@ class Attachment:
     own: tuple[tuple[int, ...], ...] = ()
 
     def own_of(self, n: int) -> tuple[int, ...]:
-        """Return which rows of constant `n` the sensor's measurements have; none: all (`Constant.own`)."""
+        """Return which components of constant `n` the sensor's measurements depend on; empty: all (see `Constant.own`)."""
         return self.own[n] if n < len(self.own) else ()
 
     def walked(self, shown: Array | None = None) -> Array | float:
-        """Return the covariance (k, k) that `slow_walk` adds to a measurement; 0 where there is no slow state.
+        """Return the covariance (k, k) that `slow_walk` adds to a measurement; 0 where it adds nothing.
 
         Args:
-            shown: (k, n) d measurement / d (slow state); default: the measurement shows each of its axes.
+            shown: (k, n) d measurement / d (slow state); None: the unit matrix.
         """
         if self.slow_walk is None:
             return 0.0
         walk = np.diag(self.slow_walk)
         return walk if shown is None else np.asarray(shown @ walk @ shown.T)
 
+    @property
+    def body_m(self) -> Array:
+        """Position (3,) of the body at the measurement, in world, m."""
+        return np.asarray(self.T_world_body.translation() + self.carried_m)
+
+    def sensor_m(self, off_m: Array | None = None) -> Array:
+        """Return the position (3,) of the sensor at the measurement, in world, m; `off_m`: see `swing_mps`."""
+        at_state = self.T_state_sensor.translation() if off_m is None else self.T_state_sensor.transformFrom(off_m)
+        return np.asarray(self.T_world_body.transformFrom(at_state) + self.carried_m)
+
     def swing_mps(self, off_m: Array | None = None) -> Array:
-        """Return the velocity (3,) of the sensor by the turning of the body, w x l, body axes, m/s.
+        """Return the part of the sensor's velocity (3,) that comes from the rotation of the body, w x l, body axes, m/s.
 
         Args:
-            off_m: (3,) how far from its mount the sensor is, in its own axes.
+            off_m: (3,) estimated place of the sensor less that of its mount, axes of the sensor; None: zero.
         """
         return _cross(self.gyro_radps, self._lever_m(off_m))
 
@@ -132,10 +148,10 @@ class Attachment:
         return np.asarray(self.v_world_mps + self.dv_world_mps + swing)
 
     def pushed_mps2(self, off_m: Array | None = None) -> Array:
-        """Return what accelerates the sensor at the measurement but for gravity (3,), body axes, m/s^2; `off_m`: see `swing_mps`.
+        """Return the specific force (3,) at the sensor, f + a x l + w x (w x l), body axes, m/s^2; `off_m`: see `swing_mps`.
 
         Raises:
-            ValueError: it is not known what the IMU feels.
+            ValueError: `felt` is None.
         """
         if self.felt is None:
             raise ValueError("an attachment without what the IMU feels")
@@ -154,14 +170,14 @@ class Residual:
 
     Attributes:
         raw: (k,) in m, rad or m/s. cov: (k, k) of the measurement.
-        jacobian: gives (k, 6) d raw / d (body tangent of the state's pose), for the predicted covariance.
-        slow_jacobian: gives (k, n) d raw / d (slow state), for the same; None: it has no part in that.
-        velocity_jacobian: gives (k, 3) d raw / d (velocity in world), for the same; None: it has no part in that.
-        constant_jacobians: gives (k, n) d raw / d (each of the attachment's constants), for its factor.
-        white: (k, k) covariance of what it does not share with the measurements beside it; None: all of `cov` (see `white_cov`).
-        expected_nis: expected square of the factor; None: that of its length, one per axis.
+        jacobian: returns (k, 6) d raw / d (body tangent of the state's pose).
+        slow_jacobian: returns (k, n) d raw / d (slow state); None: the residual does not depend on it.
+        velocity_jacobian: returns (k, 3) d raw / d (velocity in world); None: the residual does not depend on it.
+        constant_jacobians: returns (k, n) d raw / d (constant) for each of the attachment's constants.
+        white: (k, k) part of `cov` that is independent of the sensor's neighbouring measurements; None: all of it.
+        expected_nis: expected squared error of its factor; None: k, the number of its axes.
         prior: prior probability of this hypothesis.
-        size_m, size_deg: physical size, for the ledger.
+        size_m, size_deg: physical size, for the ledger; None: it has none in that unit.
     """
 
     raw: Array
@@ -178,7 +194,7 @@ class Residual:
 
     @property
     def white_cov(self) -> Array:
-        """Covariance (k, k) of what it does not share with the measurements beside it."""
+        """Part (k, k) of `cov` that is independent of the sensor's neighbouring measurements."""
         return self.cov if self.white is None else self.white
 
     def _spread(self, inflation: Array | None) -> Array:
@@ -189,7 +205,7 @@ class Residual:
         return gauss.square(self.raw, self._spread(inflation))
 
     def normalised(self, inflation: Array | None = None) -> Array:
-        """The residual (k,) by a root of `cov` (+ `inflation`): its square is `nis`."""
+        """The residual (k,) divided by the Cholesky root of `cov` (+ `inflation`): its squared length is `nis`."""
         s = self._spread(inflation)
         if len(self.raw) == 1:
             return np.asarray(self.raw / np.sqrt(s[0]))
@@ -207,7 +223,7 @@ class Decision:
     Attributes:
         mode: index of the hypothesis that enters the graph.
         weight: factor on its information, in (0, 1].
-        kernel: robust loss of what is weighted so, or None.
+        kernel: robust loss of the weighted residual, or None.
     """
 
     mode: int = 0
@@ -216,22 +232,25 @@ class Decision:
 
 
 LATE = "late"
-"""Axis of a slow state, a constant: the delay of all stamps of a sensor, which `time_offset_s` would correct."""
+"""Name of a constant axis of a slow state: time of measurement less the stamp, s, of a sensor; `time_offset_s` would correct it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SlowProcess:
-    """A slow state: per axis a first-order Gauss-Markov process.
+    """A slow state of a sensor: each of its k axes is a first-order Gauss-Markov process about zero, or a constant.
 
     Attributes:
-        name: for outputs. offset: what its constants are together, where it has others beside them.
-        axes: k names. units: k of them. scale: (k,) from the state's units to these.
-        sigma: (k,) standing size. time_constant_s: (k,) correlation time; inf for a constant.
-        no_tails: axes of constants that are never far from zero; a mount may be turned by any angle.
-        jumps: put a robust loss on its steps. far: axes that together may stand much farther off than sigma; tails of their prior.
-        needs_company: leave it out where no second sensor can tell it from motion; its size is then
-            added to the bounds.
-        anew_after_s: where the sensor was silent for so long it is drawn anew, and says nothing of what it was before; inf: never.
+        name: of the state, for outputs.
+        axes: name of each axis. units: unit of each axis in outputs. scale: (k,) factor from the state's unit to that one.
+        sigma: (k,) standard deviation of the process. time_constant_s: (k,) its correlation time; inf: the axis is a constant.
+        offset: what a warning calls the constant axes, where not all axes are constants; empty: `name`.
+        no_tails: constant axes whose prior is Gaussian, because they are never far from zero. The other constants have the tails of
+            Student's t: a mount may be turned by any angle.
+        jumps: whether a step may be a jump; steps then have a robust loss.
+        far: axes that, together, may stay at a level many sigmas from zero, as after a jump; their priors then have Cauchy tails.
+        needs_company: whether it is estimated only if a second sensor can tell it from motion. If none can, it is left out of the
+            graph, and its size is added to the bounds.
+        anew_after_s: a silence of the sensor after which the state is independent of what it was before; inf: it never is.
     """
 
     name: str
@@ -259,35 +278,37 @@ class SlowProcess:
 
     @property
     def late(self) -> int | None:
-        """Number of the axis that is how much later than stamped the sensor measures, s; None where there is none."""
+        """Number of the axis `LATE`; None where there is none."""
         return self.axes.index(LATE) if LATE in self.axes else None
 
     @property
     def far_axes(self) -> NDArray[np.bool_]:
-        """Which axes (k,) may stand far off, and jump."""
+        """Which axes (k,) may stay far from zero (`far`)."""
         return np.array([axis in self.far for axis in self.axes])
 
     def after(self, dt_s: float) -> tuple[Array, Array]:
-        """Return what share of the state is left after a time (k,), and the variance (k,) that has come to it."""
+        """Return the factors (k,) by which the state has decayed after `dt_s`, and the variances (k,) of the noise added since."""
         kept = np.exp(-dt_s / self.time_constant_s)
         return kept, self.sigma**2 * (1.0 - kept**2)
 
 
 CONSTANT_TAILS = 9.0
-"""Squared sigmas at which the variance of a constant's prior doubles."""
+"""Square of a constant's estimate, in squared sigmas of its prior, at which the re-weighted variance of that prior has doubled."""
 TIME_OFFSET = "time_offset_s"
+"""Key of vessel.yaml that a sensor's estimated time of measurement less its stamp is added to."""
 PLACE = ("mount.xyz_m[0]", "mount.xyz_m[1]", "mount.xyz_m[2]")
+"""Keys of vessel.yaml that the estimated place of an antenna, less the configured one, is added to."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Constant:
-    """Something that does not change in a run and that some of a sensor's measurements share; expected to be zero.
+    """A vector (k,) that is the same throughout a run and that several of a sensor's measurements depend on; its prior is about zero.
 
     Attributes:
-        name: for warnings. sigma: (k,).
-        corrects: for each of the k, the key of vessel.yaml that it is added to, in its unit; none for what was surveyed.
-        own: which of the k this sensor's measurements have, where it shares it with other sensors; none: all.
-        of_another: how many, from the first on, another sensor has too, which says them.
+        name: for warnings. sigma: (k,) standard deviations of the prior.
+        corrects: for each component, the key of vessel.yaml that it is added to, in the unit of that key; empty for what was surveyed.
+        own: components that this sensor's measurements depend on, where it shares the constant with other sensors; empty: all.
+        of_another: number of components, counted from the first, that belong to another sensor as well; warnings name that one.
     """
 
     name: str
@@ -298,18 +319,18 @@ class Constant:
 
     @property
     def settings(self) -> list[tuple[int, str]]:
-        """Number and key of each setting of this sensor that it corrects."""
+        """Component and key of each setting of this sensor that the constant corrects."""
         return [(n, key) for n, key in enumerate(self.corrects) if not self.own or n in self.own]
 
     def widened(self, value: Array) -> Array:
-        """Return the sigmas (k,) of its prior re-weighted at an estimate (k,): it has the tails of Student's t.
+        """Return the sigmas (k,) of the prior, re-weighted at an estimate (k,): the prior has the tails of Student's t.
 
-        With a Gaussian one, a tag that was surveyed 0.5 m wrong pulls two good ones along (error at the berth 0.5 m; 0.05 m with tails).
+        With a Gaussian prior, a tag surveyed 0.5 m wrong pulls two good ones along: error at the berth 0.5 m, with tails 0.05 m.
         """
         return self.sigma * np.sqrt(1.0 + self._squares(value) / CONSTANT_TAILS)
 
     def cost(self, value: Array) -> float:
-        """Return -log of how probable a value (k,) is, but for a constant."""
+        """Return -log of the prior's density at a value (k,), up to an additive constant."""
         squares = self._squares(value)
         together = ~self._alone
         costs = np.append(squares[~together], squares[together][:1])
@@ -317,7 +338,7 @@ class Constant:
 
     @property
     def _alone(self) -> NDArray[np.bool_]:
-        """Which of the k have tails of their own: that an antenna sits far off says nothing of a delay."""
+        """Components (k,) with tails of their own; all others share theirs. An antenna that sits far off says nothing of a delay."""
         return np.array([key == TIME_OFFSET for key in self.corrects] or [False] * len(self.sigma))
 
     def _squares(self, value: Array) -> Array:
@@ -326,7 +347,12 @@ class Constant:
 
 
 def corrections(solved: Iterable[tuple[Constant, Array]], mount: Any) -> dict[str, float]:
-    """Return what the estimate of a sensor's constants adds to its settings, by their keys; a place is turned into the axes of its mount (gtsam.Pose3)."""
+    """Return what the estimates of a sensor's constants add to its settings, by their keys in vessel.yaml.
+
+    Args:
+        solved: constants and their estimates (k,). mount: pose of the sensor in body (gtsam.Pose3): a place is estimated in its axes,
+            and returned in those of body.
+    """
     found = {key: float(value[n]) for constant, value in solved for n, key in constant.settings}
     if PLACE[0] in found:
         off_m = mount.rotation().matrix() @ np.array([found[key] for key in PLACE])
@@ -335,19 +361,23 @@ def corrections(solved: Iterable[tuple[Constant, Array]], mount: Any) -> dict[st
 
 
 def antenna_off_m(corrected: Mapping[str, float]) -> Array | None:
-    """Return how far from where it is taken to sit an antenna is (3,), m, body axes; None where that is not estimated."""
+    """Return an antenna's estimated place less the configured one (3,), m, body axes; None where it is not estimated.
+
+    Args:
+        corrected: as `corrections` returns it.
+    """
     return np.array([corrected[key] for key in PLACE]) if PLACE[0] in corrected else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FalseModel:
-    """What a sensor's false measurements look like.
+    """How often a sensor's measurements are false, and how their errors are distributed.
 
     Attributes:
-        probability: that a measurement is false. cov: (k, k) of a false residual, around the truth.
-        repeats: probability that a false one that follows a false one repeats its error (a moored boat
-            taken for another one is so again in the next scan).
-        news: share of its evidence for right or false that is independent of the measurement before it.
+        probability: that a measurement is false. cov: (k, k) of a false one's residual, about the truth.
+        repeats: probability that a false measurement repeats the error of a false one before it: a moored boat that is taken
+            for another one is so again in the next scan.
+        news: share of a measurement's evidence, for being right or false, that is independent of the measurement before it.
     """
 
     probability: float
@@ -362,11 +392,11 @@ def _unknown() -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hint:
-    """What a measurement says of the body by itself, before there is an estimate. NaN: nothing.
+    """What a single measurement says of the body, before there is an estimate. NaN: nothing.
 
     Attributes:
-        p_world_m, p_sigma_m: (3,) place, lever arms aside. v_world_mps: (3,) velocity.
-        yaw_rad, yaw_sigma_rad: heading, from east, counter-clockwise.
+        p_world_m, p_sigma_m: (3,) position of the sensor, as lever arms are not removed, and its sigmas. v_world_mps: (3,) velocity.
+        yaw_rad, yaw_sigma_rad: yaw of the body, from east, counter-clockwise, and its sigma.
     """
 
     p_world_m: Array = field(default_factory=_unknown)
@@ -378,28 +408,28 @@ class Hint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensor:
-    """One row of the table of sensors.
+    """One row of the table of sensors: all that builder and solvers know of a kind of sensor.
 
     Attributes:
-        kind: what `kind:` in vessel.yaml says.
-        measurement, config: their classes.
-        residuals: all hypotheses of a measurement at the current estimate.
-        ideal: the noise-free measurement that a state would give (used by conformance tests).
-        hint: what a measurement says at the start; takes it, the mount's yaw (rad) and the datum.
-        slow: the slow state that a config asks for.
-        factors: factors of the chosen hypothesis; None: the linear one of its residual is its factor (`graphloc.linear`).
-        false: the hypothesis that a measurement is false; None: the sensor has no such hypothesis
-            and is guarded by its kernel alone.
-        constants: that a config's measurements may share.
-        scaled: keys of its configuration that scale the sigmas of a measurement, and the axes (of k) that each scales.
-        describe: what of a measurement its row of the ledger should say.
-        berths: places that its slow state moves, and that the vessel is seen from.
-        synthetic: measurements made from the configuration over the run's stamps (no topic).
-        one_likelihood: the modes are maxima of one likelihood, which is the factor of each: doubt between them takes
-            no weight from it.
-        absolute: whether it says something about position (for health).
-        company: whether it can tell another sensor's slow error from motion.
-        in_world: whether it is given in world coordinates, so that the datum must be known.
+        kind: as `kind:` in vessel.yaml.
+        measurement, config: classes of its measurements and of its configuration.
+        residuals: returns the residual of each hypothesis of a measurement, at the current estimate.
+        ideal: returns the noise-free measurement that a state would give (for conformance tests).
+        hint: returns what a measurement says at the start, given the yaw of the sensor's mount (rad) and the datum.
+        slow: returns the slow state of a sensor that is configured so; None: it has none.
+        factors: returns the factors of the hypothesis that was chosen; None: the linearised residual is the factor (`graphloc.linear`).
+        false: returns how false measurements look; None in its place: no measurement is taken for false, and the robust loss alone
+            limits what a wrong one does.
+        constants: returns the constants that several measurements of a sensor depend on.
+        scaled: returns, for a measurement, the keys of its configuration that scale its sigmas, each with the axes (of k) that it scales.
+        describe: returns what the ledger should say of a measurement besides.
+        berths: returns the berths that the sensor's slow state moves (floating docks), and from which the vessel is seen.
+        synthetic: makes the measurements, over the stamps of the run, of a sensor that is configured and has no topic.
+        one_likelihood: whether the hypotheses are maxima of one likelihood, and that is the factor whichever is chosen. Doubt between
+            them then takes no weight from the factor.
+        absolute: whether it measures position.
+        company: whether, beside another sensor, it can tell that one's slow error from motion.
+        in_world: whether its measurements are in world coordinates, so that the datum must be known.
         along_body: whether it measures motion along the body's axes: with positions, that tells the heading.
     """
 
@@ -424,96 +454,5 @@ class Sensor:
     along_body: bool = False
 
     def of(self, config: SensorConfig) -> Sensor:
-        """Return the row of a sensor that is configured so: poses of height or heading alone are no positions, and no company."""
+        """Return the row as it holds for a configuration: poses that give only height or heading are neither `absolute` nor `company`."""
         return self if config.tells_place else replace(self, absolute=False, company=False)
-
-
-class InertialRow(Protocol):
-    """The row of the inertial sensor: it links states instead of measuring one."""
-
-    kind: str
-
-    @property
-    def config(self) -> type[SensorConfig]:
-        """The class of its configuration."""
-        ...
-
-    def link(
-        self, imu: ImuSeries, config: Any, R_body_imu: Array, gravity_mps2: float, noise_scale: float = 1.0
-    ) -> InertialLink:
-        """Return the links that one IMU gives, its noise densities scaled."""
-        ...
-
-
-class Going(NamedTuple):
-    """What goes on where the inertial sensor is silent: its bias, and the velocity (3,), m/s, along the body's axes."""
-
-    bias: Any
-    v_body_mps: Array
-
-    @classmethod
-    def of(cls, state: Any, bias: Any) -> Going:
-        """What goes on from a NavState."""
-        return cls(bias, np.asarray(state.attitude().unrotate(state.velocity())))
-
-
-class InertialLink(Protocol):
-    """Preintegration of one IMU between any two stamps."""
-
-    def integrate(self, start_ns: int, stop_ns: int, bias: Any, going: Going | None = None) -> Any:
-        """Return the preintegrated measurement from `start_ns` to `stop_ns` (start < stop).
-
-        Args:
-            bias: about which it is linearised. going: what goes on in a hole of the data, which is linearised about its bias;
-                without, `bias` and a vessel at rest.
-        """
-        ...
-
-    def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
-        """Add samples (N, 6), late ones among them: specific force, m/s^2, and rate, rad/s, in IMU axes."""
-        ...
-
-    def leave_out(self, after_ns: int, until_ns: int) -> None:
-        """Treat an interval as a gap, however short: its samples are dropped, and those that are added later are after it."""
-        ...
-
-    def pause(self, after_ns: int, until_ns: int) -> None:
-        """Allow for no time having passed between two samples, however near to each other: a clock may have been set."""
-        ...
-
-    def forget(self, before_ns: int) -> None:
-        """Drop the samples before a stamp, but for the last of them."""
-        ...
-
-    def factor(self, k: int, j: int, preintegrated: Any) -> Any:
-        """Return the factor between states `k` and `k + 1` with the bias of slow node `j`."""
-        ...
-
-    def gyro_at(self, stamps_ns: NDArray[np.int64]) -> Array:
-        """Return the raw angular rates (M, 3) in body axes at M stamps."""
-        ...
-
-    def gyro_variance_at(self, stamps_ns: NDArray[np.int64]) -> Array:
-        """Return the variances (M,), each axis, rad^2/s^2, of what `gyro_at` gives, biases aside."""
-        ...
-
-    def felt_at(self, stamps_ns: NDArray[np.int64]) -> Array:
-        """Return specific force and change of the rate (M, 6) about M stamps, body axes, m/s^2 and rad/s^2; means, so that a hull may vibrate."""
-        ...
-
-    @property
-    def gravity_mps2(self) -> Array:
-        """What is to be added to a specific force (3,), world axes, m/s^2; zero where the driver has done so."""
-        ...
-
-    def bias_steps(self, from_ns: int, to_ns: int) -> Array:
-        """Return the sigmas (6,) of how far the bias goes from one stamp to another, accelerometer first."""
-        ...
-
-    def bias_sigmas(self) -> Array:
-        """Return the turn-on sigmas (6,), accelerometer first."""
-        ...
-
-    def gaps(self) -> list[tuple[int, int]]:
-        """Return the holes in the data as (start, stop) stamps in ns."""
-        ...

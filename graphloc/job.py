@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run of a sweep: what it is, whether it can be, and its rows of the table."""
+"""One run of a sweep: its parameters, whether it can run, and its rows of the table."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Job:
     """One run of a sweep: plain data, which travels to a worker.
 
     Attributes:
-        scenario, seed, changes: of the simulator, and fields of the scenario that are changed; or
-        bag, config: paths of a recording and its vessel.yaml, which the worker must see.
+        scenario, seed, changes: of the simulator, the last being fields of the scenario and their values; or
+        bag, config: paths of a recording and its vessel.yaml, which the worker must be able to read.
         config_changes: keys of the configuration, written with dots, and their values as YAML.
         mode: `offline` smooths, `online` replays, `compare` does both and runs the filters.
         hold_out: fixes that are kept out and predicted (see `HoldOut.parse`), or empty.
@@ -54,7 +54,7 @@ class Job:
 
     @property
     def key(self) -> str:
-        """What tells the run from all others."""
+        """Key of the run, different from those of all others."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @property
@@ -95,10 +95,10 @@ def _split(values: str) -> list[str]:
 
 
 def check(jobs: Sequence[Job]) -> None:
-    """Find what cannot run before anything runs.
+    """Check that the jobs can run, before any does.
 
     Raises:
-        GraphlocError: a scenario, a bag, or a key that is not there, a value that is none, or nothing to measure.
+        GraphlocError: a scenario, bag or key that does not exist, a value that is not valid, or nothing to measure.
     """
     if not jobs:
         raise ConfigError("nothing to run: name scenarios (as bl1-drift) and --seeds, or a --bag with its --config")
@@ -141,7 +141,7 @@ def _simulated_config(run: SimulatedRun, job: Job) -> VesselConfig:
 
 
 def run_job(job: Job) -> list[Row]:
-    """Run one, on one thread: a row for each estimate of it, or one row with the `error`."""
+    """Run a job on one thread; return a row for each of its estimates, or one row with the `error`."""
     import numba
     from threadpoolctl import threadpool_limits
 
@@ -168,7 +168,7 @@ def _estimated(job: Job, folder: Path) -> app.Run:
 
 
 def _recorded(job: Job, folder: Path) -> tuple[Recording, VesselConfig, app.Scans | None]:
-    """Read the bag, or simulate: in memory, but for scans and images, which only a bag holds."""
+    """Read the bag, or simulate: in memory, unless there are scans or images, which only a bag holds."""
     bag, path = Path(job.bag), Path(job.config)
     if job.scenario:
         run = simulate(find_scenario(job.scenario, dict(job.changes)), job.seed)

@@ -3,7 +3,7 @@
 
 X pose of body in world (Pose3); V velocity in world (3,); B IMU bias (accelerometer, gyroscope);
 S slow state of a sensor, C constant of one (vectors), labelled with the sensor's number; A, L leaves of one
-measurement.
+measurement: of a fix, antenna in world and lever arm (Point3); of a sighting of a floating dock, A is the dock's slow state.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ STATES, NODES, LEAVES = "xv", "bs", "al"  # letters of what there is for each st
 # GTSAM's layout of `symbol` and `LabeledSymbol`, held by a test: a run asks for keys so often that calls into it show.
 _X, _V, _B, _A, _L, _S, _C = (ord(letter) << 56 for letter in "xvbalsc")
 _FIRST_LABEL = ord("A")
+_MEASUREMENTS_OF_A_SENSOR = 100_000_000  # more than one has in a run: at 200 Hz it would take six days
 
 
 def pose(k: int) -> int:
@@ -53,9 +54,10 @@ def constant(sensor_number: int, k: int) -> int:
     return _C + ((_FIRST_LABEL + sensor_number) << 48) + k
 
 
-def leaves(seq: int) -> tuple[int, int]:
-    """Keys of the two leaves (antenna in world, lever arm) of measurement number `seq`."""
-    return _A + seq, _L + seq
+def leaves(sensor_number: int, i: int) -> tuple[int, int]:
+    """Keys of the two leaves, A and L, of measurement `i` of a sensor."""
+    number = sensor_number * _MEASUREMENTS_OF_A_SENSOR + i
+    return _A + number, _L + number
 
 
 def parts(keys: NDArray[np.uint64]) -> tuple[NDArray[np.str_], NDArray[np.int64]]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from graphloc.errors import GraphlocError
 
-RECORDED_AT = ", recorded at "  # in a reason, before the time that tells its message from others
+RECORDED_AT = ", recorded at "  # in a reason, before the time at which its message was recorded
 
 
 class Outcome(enum.StrEnum):
@@ -44,7 +44,7 @@ class LedgerRow:
         nis: squared residual normalised by the measurement's own covariance.
         dof: number of measured axes.
         reason: why it was not used fully.
-        detail: what of it a reader wants to know, e.g. the camera and the tags of a sighting.
+        detail: what else a reader wants to know of it, e.g. the camera and the tags of a sighting.
         count: messages that this row stands for.
     """
 
@@ -67,7 +67,7 @@ class LedgerRow:
 
     @property
     def common_reason(self) -> str:
-        """The reason without the time at which its message was recorded: as others with it have it."""
+        """The reason without the time at which the message was recorded, so that equal reasons are equal texts."""
         return self.reason.partition(RECORDED_AT)[0]
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Factors for residuals that GTSAM has no native factor for: linearised here, anew at every pass.
+"""Factors of residuals that GTSAM has no native factor for. They are linearised here, anew at every pass.
 
-A `CustomFactor` calls back into Python at every linearisation, which costs 25 times as much (measured).
+A `CustomFactor` would call back into Python at every linearisation, which takes 25 times as long (measured).
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Term(NamedTuple):
     """A state of a linear factor.
 
     Attributes:
-        key: of the state. point: the value whose tangent the factor is written in. jacobian: (k, dim) d raw / d tangent.
-        offset: (dim,) the estimate's coordinates in that tangent; None: the point is the estimate.
+        key: of the state. point: value in whose tangent the factor is written. jacobian: (k, dim) d raw / d tangent.
+        offset: (dim,) coordinates of the estimate in that tangent; None: the point is the estimate.
     """
 
     key: int
@@ -43,10 +43,10 @@ class Term(NamedTuple):
 def pose_term(at: Attachment, jacobian: Array) -> Term:
     """Return the pose's term; jacobian: (k, 6) d raw / d body tangent, at the estimate.
 
-    A solver that goes on from an older linearisation applies a factor's Jacobian in *that* tangent, whatever point the
-    factor was written at. The same shift of the world is then R^T d for one and R'^T d for the other, and what only
-    relates two places (a vessel and the dock that it sees, to 3 mm) seems to know where both are: turned by 5 mrad, to
-    3 mm / 5 mrad = 0.6 m, again with each sighting. So the factor is written in the solver's own tangent.
+    A solver that keeps older linearisations applies a factor's Jacobian in the tangent of its own, older pose R', even if the factor was
+    written at a newer pose R. A shift d of the world is R^T d in one tangent and R'^T d in the other. A factor that only relates two
+    places, such as a vessel and the dock that it sees to 3 mm, then seems to tell where both are: with 5 mrad between R and R',
+    to 3 mm / 5 mrad = 0.6 m, and again with each sighting. So the factor is written in the solver's own tangent.
     """
     if at.T_solver is None:
         return Term(at.pose_key, at.T_world_body, jacobian)
@@ -92,9 +92,10 @@ def linear_update(
 
     Args:
         residual: raw (k,) and its covariance, at the estimate.
-        terms: the states; of the pose, `pose_term`.
-        decision: of this pass.
-        points: shared by factors with the same terms, and filled by them: GTSAM takes longer to store a pose than to make a factor.
+        terms: of the states; that of a pose is made by `pose_term`.
+        decision: weight and kernel of this pass.
+        points: linearisation points, which factors with the same terms share and fill: GTSAM takes longer to store a pose than to
+            make a factor. None: of this factor alone.
     """
     weight = decision.weight
     if decision.kernel is not None:

@@ -55,8 +55,8 @@ class GnssPosition(Measurement):
 
     Attributes:
         position: geodetic position of the antenna phase centre (WGS 84).
-        cov_enu_m2: (3, 3) covariance as reported, east-north-up, m^2; `NO_HEIGHT_M2` upwards where the receiver gives no
-            height: that of `position` then means nothing.
+        cov_enu_m2: (3, 3) covariance as reported, east-north-up, m^2. Its upward variance is `NO_HEIGHT_M2` where the receiver gives
+            no height; the height in `position` then means nothing.
     """
 
     position: Geodetic
@@ -76,7 +76,7 @@ class GnssPosition(Measurement):
 
 
 def world_from_fixes(fixes: Sequence[GnssPosition], datum: Datum) -> Array:
-    """Return places (N, 3) in world, m; a fix without a height lies as high as the datum, for a degree is longer higher up."""
+    """Return the places (N, 3) in world, m, of fixes. One without a height is put at the datum's: metres per degree grow with height."""
     level = datum.origin.height_m
     places = [m.position if m.has_height else m.position._replace(height_m=level) for m in fixes]
     return datum.enu_from_geodetic(*np.array(places).reshape(-1, 3).T)
@@ -154,7 +154,7 @@ class PoseFix(Measurement):
     Attributes:
         axes: which of `AXES` are measured, in the order of `AXES`.
         modes: at least one; probabilities sum to at most 1, what is missing is 'none of them'.
-        news: share of its evidence for right or false that is independent of the one before it.
+        news: share of its evidence, for being right or false, that is independent of the measurement before it.
     """
 
     axes: tuple[str, ...]
@@ -179,13 +179,13 @@ class PoseFix(Measurement):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TagMode:
-    """One pose of a camera that explains what it saw of tags; their frame at rest.
+    """One pose of a camera that explains the tags in an image, with their frame at rest.
 
     Attributes:
         p_world_camera_m: (3,). R_world_camera: (3, 3), optical axes to world.
-        cov: (6, 6) of the tags' middle seen from the camera, m, and of the camera's attitude, a small rotation, rad; both
-            in the camera's axes: a bearing is known to millimetres where attitude and distance are not, and so it stays
-            whatever attitude the rest of the run says.
+        cov: (6, 6) of the tags' middle seen from the camera, m, and of the camera's attitude, a small rotation, rad; both in the
+            camera's axes. So the bearing, known to millimetres where attitude and distance are not, keeps its weight whatever
+            attitude the rest of the run gives.
         probability: prior probability of this mode, by how well it fits the image.
     """
 
@@ -212,12 +212,12 @@ class TagSighting(Measurement):
         points_m: (4 K, 3) corners of each tag in turn, in world, the frame at rest; of a tag: top-left, top-right,
             bottom-right, bottom-left of the print.
         pivot_m: (3,) point in world that the frame turns about: a dock's origin.
-        rays: (4 K, 2) where they are seen: x / z, y / z in the camera's optical axes, distortion removed.
-        cov: (8 K, 8 K) of the rays, u0, v0, u1, ...: of the corners in the image. That of the modes has what the survey
-            does not know in it, too.
+        rays: (4 K, 2) where the corners are seen: x / z, y / z in the camera's optical axes, distortion removed.
+        cov: (8 K, 8 K) of the rays, in the order u0, v0, u1, ...: error of the corners in the image. The covariances of the modes
+            include that of the survey as well.
         t_body_camera_m, R_body_camera: (3,), (3, 3) the camera's mount.
-        modes: poses that explain it, likeliest first; probabilities sum to 1.
-        px: a pixel of the image as a ray (1 / focal length); 0: not known.
+        modes: poses of the camera that explain the sighting, likeliest first; probabilities sum to 1.
+        px: size of a pixel as a ray (1 / focal length); 0: not known.
     """
 
     camera: str
@@ -246,7 +246,7 @@ class TagSighting(Measurement):
 
     @property
     def tags(self) -> tuple[tuple[str, int], ...]:
-        """What tells the tags from all others: family and id of each."""
+        """Family and id of each tag."""
         return tuple(zip(self.families, self.numbers, strict=True))
 
 
@@ -271,7 +271,7 @@ class TagView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HeightPrior(Measurement):
-    """Height of the body origin over the ellipsoid less that of the datum, from waterline and tide: m."""
+    """Height of the body origin above that of the datum, m (both over the ellipsoid), from waterline and tide; with its sigma."""
 
     height_m: float
     sigma_m: float
@@ -296,8 +296,7 @@ class ImuSeries:
     Attributes:
         sensor: its name under `sensors:`.
         stamps_ns: (N,) int64, strictly increasing.
-        accel_mps2: (N, 3) specific force (gravity included, +g upwards at rest) unless the
-            configuration declares it removed.
+        accel_mps2: (N, 3) specific force: at rest +g upwards, or zero where the configuration says that gravity is removed.
         gyro_radps: (N, 3) angular rate.
         seqs: (N,) int64 arrival numbers.
     """
@@ -323,7 +322,7 @@ class ImuSeries:
         return len(self.stamps_ns)
 
     def where(self, kept: slice | NDArray[np.bool_]) -> ImuSeries:
-        """Return some of the samples."""
+        """Return some of the samples; `kept`: (N,) whether each is kept, or a slice."""
         return replace(
             self,
             stamps_ns=self.stamps_ns[kept],

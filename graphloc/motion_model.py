@@ -7,9 +7,9 @@ Along each horizontal axis of the body the velocity is modelled as an Ornstein-U
 
 v_a, v_b: velocities in world, dt apart; a, b: the axis in world at both times, rotated by the IMU; s: usual speed along the
 axis; d: usual change over 10 s. Both are learned while the velocity is known, and added to what any vessel may do. Over a
-second the IMU is far more accurate than this model. But its errors accumulate, above all those of the tilt, while a vessel's
-mean acceleration over a minute is small and its speed is limited. The filters of the theses use the same knowledge when they
-subtract the mean acceleration.
+second the IMU is far more accurate than this model. But the IMU's errors accumulate, above all by those of the tilt, while a vessel's
+speed is limited, and its mean acceleration over a minute is small. The filters of the theses use that, too, when they subtract the
+mean acceleration.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ from graphloc.frames import Array
 from graphloc.graph import Decision, Residual
 from graphloc.linear import Term, linear_update
 
-UNSURE_MPS = 0.2  # sigma of the velocity: above it the model is applied, below it the model is learned
-_SPEED_MPS, _CHANGE_MPS, _OVER_S = 1.0, 0.5, 10.0  # what any vessel may do, beside what was learned
-_GUESS = (2.0, 1.0)  # m/s: usual speed and change before any is learned; counts as 10 s of data
+UNSURE_MPS = 0.2  # sigma of the velocity, above which the model is applied, and below which it is learned
+# Speed, and its change within a time, that any vessel may have beyond what was learned.
+_SPEED_MPS, _CHANGE_MPS, _OVER_S = 1.0, 0.5, 10.0
+_GUESS = (2.0, 1.0)  # m/s: usual speed and change before anything is learned; counts as 10 s of data
 _QUICKEST = 0.95  # share of the velocity that may be forgotten within 10 s
 _KERNEL = KernelConfig(kind="cauchy", scale=2.0)  # casting off or stopping is unusual: there the IMU prevails
 
@@ -40,7 +41,7 @@ class Moving(NamedTuple):
 
     @classmethod
     def of(cls, values: Any, k: int) -> Moving:
-        """Return that of state k among values (gtsam.Values)."""
+        """Return the velocity state `k` of some values (gtsam.Values)."""
         key = keys.velocity(k)
         return cls(key, np.asarray(values.atVector(key)), values.atPose3(keys.pose(k)).rotation().matrix())
 
@@ -49,7 +50,7 @@ class MotionModel:
     """Usual speeds and changes of speed along the body's horizontal axes, forward first.
 
     Args:
-        remembered_s: over how long they are averaged.
+        remembered_s: time over which they are averaged, s.
     """
 
     def __init__(self, remembered_s: float = 300.0) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a solved run says of things that it took as given: levers, mounts, stamps, and the IMU's noise.
+"""What a solved run says of what it took as given: lever arms, mounts, stamps, and the IMU's noise.
 
-Statistics, not opinions: `graphloc.eval.calibrate` draws the conclusions.
+These are statistics only: `graphloc.eval.calibrate` draws the conclusions.
 """
 
 from __future__ import annotations
@@ -15,22 +15,23 @@ import numpy as np
 from graphloc.frames import Array
 
 Offset = Literal["x", "y", "yaw", "time"]
-"""Of a sensor: its place in body (m), its yaw there (rad), and what is to be added to its stamps (s)."""
+"""What may be off of a sensor: its place in body (m), its yaw in body (rad), or its stamps (s, to be added to them)."""
 
 Probe = Mapping[str, Sequence[Offset]]
-"""By kind of sensor: which of its offsets to look at."""
+"""By kind of sensor: the offsets to look at."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Misfit:
-    """How far what an IMU says of the motion lies from what all sensors say together.
+    """How far the motion that an IMU measures lies from that by all sensors together.
 
     Attributes:
-        squares: sum of squared residuals in standard deviations, as configured.
-        freedom: what that sum is expected to be, if the noise is configured right: the measurements' share in saying
-            where these residuals are not free to be zero.
-        needed: times the noise that would leave as much misfit as there is, where that is clearly less; else 1.
-        sigma: of `needed`, 1 sigma.
+        squares: sum of squared residuals of the IMU's factors, in configured standard deviations.
+        freedom: expected value of that sum, if the noise is configured right: less than the number of residuals, because the
+            solution follows the IMU.
+        needed: factor on the noise with which the sum would be as expected, where it is clearly not; else 1. Above 1 it is only as
+            far as the samples themselves scatter more.
+        sigma: 1 sigma of `needed`.
     """
 
     squares: float
@@ -51,8 +52,8 @@ class Offsets:
         names: sensor and offset of each of the k.
         block_s: length of a block, s.
         gradient: (n, k) g. curvature: (n, k, k) H; both of n blocks in turn.
-        gyroscope, accelerometer: of the IMU, with the noise that the run was solved with in the end.
-        noise_scale: how many times the configured noise that is.
+        gyroscope, accelerometer: misfit of the IMU, by the noise that the run was solved with in the end.
+        noise_scale: that noise over the configured one.
     """
 
     names: tuple[tuple[str, Offset], ...]

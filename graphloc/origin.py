@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where world is, and what the configuration itself says of a run there."""
+"""The origin of world, and the measurements that the configuration makes itself."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sens
     """Return the configured datum, or the median of the first fixes; height 0 where none says one.
 
     Raises:
-        InputError: none is configured, and there is no fix to take one from, or something is given in world.
+        InputError: none is configured, and there is no fix to take one from, or a sensor measures in world.
     """
     if config.datum is not None:
         datum = Datum(config.datum.geodetic)
@@ -96,10 +96,10 @@ def _why_no_receiver(recording: Recording, config: VesselConfig) -> str:
 
 
 def refuse_world_without_datum(config: VesselConfig, where: str, rows: Sequence[Sensor]) -> None:
-    """Refuse places in world that nothing says the origin of.
+    """Refuse a configuration with sensors that measure in world, if it does not give the origin of world.
 
     Raises:
-        InputError: there are such.
+        InputError: there are such sensors.
     """
     in_world = [f"sensors.{name}" for row in rows if row.in_world for name in config.of_kind(row.kind)]
     in_world += ["truth_topic"] if config.truth_topic else []

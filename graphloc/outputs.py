@@ -31,8 +31,8 @@ from graphloc.frames import Array
 from graphloc.ledger import LedgerRow
 from graphloc.plain import plain
 from graphloc.recording import Span
-from graphloc.solution import Health, Solution
-from graphloc.time import utc_text
+from graphloc.solution import LOST_BOUND_M, Solution
+from graphloc.time import NS_PER_S, seconds_text, utc_text
 from graphloc.trajectory import bounds_95
 
 _NO_FIX, _FIX = -1, 0  # of NavSatStatus
@@ -53,9 +53,9 @@ def write_run(
     """Write all files of a run but the report into an existing folder.
 
     Args:
-        folder: where to. solution: what to write. config: its effective form goes along, its mounts in numbers.
+        folder: to write into. solution: what to write. config: written in its effective form, with mounts in numbers.
         inputs: SHA-256 of each input. command: the command line. metrics: tables as plain data.
-        warnings: all that the report shows. span: which part of the bag it is.
+        warnings: all that the report shows. span: the part of the bag that the run is; None: the whole.
     """
     picked = thinned(solution.trajectory.stamps_ns, config.output.rate_hz)
     _csv(folder / "solution.csv", _solution_columns(solution), _solution_rows(solution, picked))
@@ -73,8 +73,9 @@ def write_run(
 
 
 def thinned(stamps: NDArray[np.int64], rate_hz: float) -> Array:
-    """Indices of the states to write: at most `rate_hz` a second, the last one included."""
-    slot = np.rint((stamps - stamps[0]) * 1e-9 * rate_hz).astype(np.int64)  # states move onto stamps, by under half
+    """Return the indices of the states to write: at most `rate_hz` per second, and the last one."""
+    # States move onto stamps of measurements, by under half a period.
+    slot = np.rint((stamps - stamps[0]) * 1e-9 * rate_hz).astype(np.int64)
     picked = np.flatnonzero(np.diff(slot, prepend=-1) > 0)
     return np.unique(np.append(picked, len(stamps) - 1))
 
@@ -125,9 +126,8 @@ def _tum(path: Path, solution: Solution, picked: Array) -> None:
     quaternions = Rotation.from_matrix(track.R_world_body[picked]).as_quat()
     with path.open("w", encoding="ascii") as stream:
         for k, q in zip(picked, quaternions, strict=True):
-            whole, rest = divmod(int(track.stamps_ns[k]), 1_000_000_000)
             values = " ".join(f"{v:.9f}" for v in (*track.p_world_m[k], *q))
-            stream.write(f"{whole}.{rest:09d} {values}\n")
+            stream.write(f"{seconds_text(int(track.stamps_ns[k]))} {values}\n")
 
 
 def _bag(path: Path, solution: Solution, picked: Array, body_frame: str) -> None:
@@ -139,6 +139,7 @@ def _bag(path: Path, solution: Solution, picked: Array, body_frame: str) -> None
     assert track.v_world_mps is not None
     geodetic = solution.datum.geodetic_from_enu(track.p_world_m[picked])
     quaternions = Rotation.from_matrix(track.R_world_body[picked]).as_quat()
+    bounds_m = bounds_95(track.cov)[:, 0]
     point, vector, quaternion = (t[f"geometry_msgs/msg/{n}"] for n in ("Point", "Vector3", "Quaternion"))
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         odometry = writer.add_connection("/graphloc/odometry", "nav_msgs/msg/Odometry", typestore=store)
@@ -146,7 +147,7 @@ def _bag(path: Path, solution: Solution, picked: Array, body_frame: str) -> None
         for i, k in enumerate(picked):
             stamp = int(track.stamps_ns[k])
             R = track.R_world_body[k]
-            time = t["builtin_interfaces/msg/Time"](sec=stamp // 1_000_000_000, nanosec=stamp % 1_000_000_000)
+            time = t["builtin_interfaces/msg/Time"](sec=stamp // NS_PER_S, nanosec=stamp % NS_PER_S)
             twist_cov = np.zeros((6, 6))
             twist_cov[:3, :3], twist_cov[3:, 3:] = R.T @ solution.v_cov[k] @ R, solution.gyro_cov[k]
             message = t["nav_msgs/msg/Odometry"](
@@ -169,7 +170,7 @@ def _bag(path: Path, solution: Solution, picked: Array, body_frame: str) -> None
             )
             writer.write(odometry, stamp, store.serialize_cdr(message, "nav_msgs/msg/Odometry"))
             status = t["sensor_msgs/msg/NavSatStatus"](
-                status=_NO_FIX if solution.health[k] is Health.LOST else _FIX, service=1
+                status=_NO_FIX if bounds_m[k] > LOST_BOUND_M else _FIX, service=1
             )
             position = t["sensor_msgs/msg/NavSatFix"](
                 header=t["std_msgs/msg/Header"](stamp=time, frame_id=body_frame),
@@ -242,7 +243,7 @@ _BERTH_COLUMNS = (
 
 
 def _berth_files(solution: Solution) -> dict[str, BerthTrack]:
-    """File names of the berths; what a name cannot have in a file system becomes a dash."""
+    """Return the file names of the berths; characters that a file system may refuse become dashes."""
     files: dict[str, BerthTrack] = {}
     for berth in solution.berths:
         name = re.sub(r"[^\w-]+", "-", berth.berth.name)

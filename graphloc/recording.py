@@ -42,9 +42,9 @@ class Span:
     """The part of a bag that a recording is, by the times at which messages were recorded.
 
     Attributes:
-        start_s, end_s: s since the beginning of the bag, which is `bag_s` long.
-        start_ns, end_ns: of the clock of recording; the end is not in it.
-        messages, left_out: how many messages of a topic lie in it, and how many do not: those are no part of the run.
+        start_s, end_s: begin and end, s since the beginning of the bag. bag_s: length of the bag, s.
+        start_ns, end_ns: begin and end by the clock of recording; a message at the end does not belong to it.
+        messages, left_out: by topic, number of messages in this part, and outside of it; the latter are no part of the run.
     """
 
     start_s: float
@@ -61,7 +61,7 @@ class Span:
         return replace(self, messages=inside, left_out=outside)
 
     def __str__(self) -> str:
-        """As said of a bag: which part, and what of it was taken."""
+        """Which part of the bag it is, and how many of the messages it takes."""
         inside = sum(self.messages.values())
         return (
             f"{self.start_s:.1f} s to {self.end_s:.1f} s of {self.bag_s:.1f} s, begun at {utc_text(self.start_ns)}: "
@@ -72,7 +72,7 @@ class Span:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recording:
-    """What a front-end hands over.
+    """A run as a front-end has read it.
 
     Attributes:
         source: the bag's path, with which part of it, or '(simulated)'.
@@ -82,13 +82,13 @@ class Recording:
             with the measurements and the IMU samples they add up to `message_count`.
         message_count: messages in the recording.
         topics: topic of each configured sensor.
-        mounts: body -> sensor (t (3,), R (3, 3)) of sensors whose mount came from /tf_static.
+        mounts: poses in body, t (3,) and R (3, 3), of sensors whose mount came from /tf_static.
         truth: true body trajectory in world, if known.
-        check_speed: forward speed that is compared, not fused.
+        check_speed: forward speed of a sensor that is not fused: the estimate is compared with it.
         tag_views: sightings of tags that are not in the survey.
         warnings: one line each, for the report.
         span: which part of the bag it is; None: the whole.
-        clock_doubts: why no pose is to be called good: sensors that the bounds take for on one clock are not.
+        clock_doubts: sentences on sensors that are not on one clock, although the bounds assume it. No pose is then called good.
     """
 
     source: str
@@ -127,7 +127,7 @@ class Recording:
         return LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic=topic, outcome=outcome, reason=reason)
 
     def imu_rows(self, which: NDArray[np.bool_] | slice, outcome: Outcome, reason: str) -> list[LedgerRow]:
-        """Return the ledger rows of samples of its IMU: (N,) of which, or a slice."""
+        """Return the ledger rows of some samples of its IMU; `which`: (N,) whether of each, or a slice."""
         assert self.imu is not None
         sensor, seqs, stamps_ns = self.imu.sensor, self.imu.seqs[which].tolist(), self.imu.stamps_ns[which].tolist()
         topic = self.topics.get(sensor, "")
@@ -137,7 +137,7 @@ class Recording:
         ]
 
     def lost(self, sensors: Container[str]) -> str:
-        """Return a clause on why most of the messages of these sensors that gave nothing gave nothing; empty where none is."""
+        """Return a clause with the commonest reason why messages of these sensors gave no measurement; empty where all did."""
         reasons: Counter[str] = Counter()
         for row in self.rows:
             if row.sensor in sensors:

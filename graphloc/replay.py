@@ -33,7 +33,7 @@ from graphloc.time import NS_PER_S, stamps_of
 from graphloc.trajectory import Trajectory
 
 Status = Callable[[float, float, Estimate | None, str], None]
-"""Called with s of the run, its whole length, the newest estimate, and what the start waits for."""
+"""Called with the time in the run, s, its whole length, s, the newest estimate or None, and what the start waits for."""
 
 
 def silent(_at_s: float, _whole_s: float, _estimate: Estimate | None, _waiting: str) -> None:
@@ -45,8 +45,8 @@ class Replayed:
     """Result of a replay.
 
     Attributes:
-        recording: with the matches that were made. solution: each pose as known at its time. estimates: N of these.
-        update_s: (N,) computing time of each, s.
+        recording: the run, with the matches that were made. solution: its poses, each as known at its time.
+        estimates: N, in order. update_s: (N,) computing time of each, s.
     """
 
     recording: Recording
@@ -56,9 +56,10 @@ class Replayed:
 
 
 def arrivals(recording: Recording, late_ns: Mapping[int, int] | None = None) -> Iterator[Measurement]:
-    """Yield IMU samples and measurements as they arrived; those that a front-end computed, when the IMU has reached them.
+    """Yield IMU samples and measurements in the order in which they arrived.
 
-    A simulation without a bag has no order of arrival: its stamps are used.
+    What a front-end computed comes when the IMU has reached its stamp. A simulation without a bag has no order of arrival, so the
+    order of its stamps is used.
 
     Args:
         late_ns: by arrival number, delay of a measurement after its stamp, instead of its arrival.
@@ -93,8 +94,8 @@ class _Session:
     """A smoother that is fed a recording, and all that it returned.
 
     Attributes:
-        estimates: in order. update_s: the time that each took. rows: of its ledger.
-        events: with the IMU stamp (ns). first_ns, last_ns: of the IMU.
+        estimates: in order. update_s: computing time of each, s. rows: ledger rows.
+        events: each with the IMU's stamp (ns) at that time. first_ns, last_ns: first stamp of the IMU, and the last one so far.
     """
 
     def __init__(self, smoother: OnlineSmoother, recording: Recording, status: Status) -> None:
@@ -146,7 +147,7 @@ class _Session:
 
     def _show_waiting(self, stamp_ns: int) -> None:
         """Report once per second of the run what the start waits for."""
-        second = (stamp_ns - self.first_ns) // 1_000_000_000
+        second = (stamp_ns - self.first_ns) // NS_PER_S
         if self.smoother.waiting_for and second != self._shown_s:
             self._shown_s = second
             self._status(float(second), self._length_s, None, self.smoother.waiting_for)
@@ -160,7 +161,6 @@ def replay(
     speed: float | None = None,
     lag_s: float = 10.0,
     datum: Datum | None = None,
-    smoother: OnlineSmoother | None = None,
     late_ns: Mapping[int, int] | None = None,
     stoppable: bool = False,
     status: Status = silent,
@@ -170,13 +170,13 @@ def replay(
     Args:
         scans: scans to match for the aerial sensors; None: use the matches in the recording.
         speed: times real time; None: as fast as possible. datum: origin of world; None: as `OnlineSmoother` finds it.
-        smoother: to use instead of a new one, for tests. late_ns: as for `arrivals`.
+        late_ns: as for `arrivals`.
         stoppable: Ctrl-C ends the replay early, and the result up to then is returned, if it had started.
 
     Raises:
         SolveError: it never started. InputError: a map or LiDAR that cannot be used.
     """
-    smoother = smoother or OnlineSmoother(
+    smoother = OnlineSmoother(
         config, rows=SENSORS, inertial=INERTIAL, datum=datum, mounts=recording.mounts, lag_s=lag_s
     )
     if scans is not None:
@@ -243,7 +243,7 @@ def _result(session: _Session, recording: Recording, config: VesselConfig, *, in
 
 
 def _timed(happened: Sequence[tuple[int, Event]], estimates: Sequence[Estimate]) -> list[Event]:
-    """Return events with their times, s since the first pose; of a guessed heading also until when, and what would end that."""
+    """Return lines on events with their times, s since the first pose; for a guessed heading also until when, and what would end it."""
     begin_ns = estimates[0].stamp_ns
     guesses_ns = [stamp_ns for stamp_ns, event in happened if event.heading_guessed]
     timed = []

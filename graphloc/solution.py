@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a solver hands over: the trajectory, what was estimated beside it, and how well it went."""
+"""What a solver returns: the trajectory, what was estimated besides, and how the solving went."""
 
 from __future__ import annotations
 
@@ -18,7 +18,11 @@ from graphloc.offsets import Offsets
 from graphloc.trajectory import Trajectory
 
 CONTRADICTING_COST = 3.0
-"""Cost over the expected one, above which measurements contradict each other: noise that is configured too small alone costs less."""
+"""Ratio of cost to expected cost above which measurements contradict each other: noise that is merely configured too small gives less."""
+
+
+LOST_BOUND_M = 25.0
+"""95 % bound of the position, m, beyond which it is of no use in a harbour."""
 
 
 class Health(enum.StrEnum):
@@ -27,13 +31,14 @@ class Health(enum.StrEnum):
     GOOD = "good"  # position sigma small, absolute sensors agree
     DEGRADED = "degraded"  # usable, but one absolute sensor is missing or disagrees, or sigma is large
     DEAD_RECKONING = "dead_reckoning"  # no absolute position agreed for a while
-    LOST = "lost"  # the covariance, or the solver, says that the pose is not known
+    LOST = "lost"  # by the covariance position or heading is not known
 
 
 class Cause(enum.Enum):
-    """What keeps an estimate from being good: what would have to change."""
+    """What keeps an estimate's health from being good."""
 
-    BOUND = enum.auto()  # its 95 % bound is too large
+    BOUND = enum.auto()  # the 95 % bound of its position is too large
+    HEADING = enum.auto()  # only the bound of its heading is too large
     NO_POSITION = enum.auto()  # no absolute sensor agrees
     SENSORS = enum.auto()  # some absolute sensors are missing or do not agree
     GUESSED_HEADING = enum.auto()  # no sensor measures the heading, and the motion does not tell it yet
@@ -42,10 +47,10 @@ class Cause(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class HealthReason:
-    """Why an estimate is not good; as text, its `text`.
+    """Why an estimate's health is not good; `str()` of it is its text.
 
     Attributes:
-        text: for a reader; empty where it is good. cause: what to do something about; None where it is good.
+        text: for a reader; empty where health is good. cause: what would have to change; None where health is good.
         sensors: those that are missing or do not agree, if that is the cause.
     """
 
@@ -59,7 +64,7 @@ class HealthReason:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SlowEstimate:
-    """A slow state of one sensor over time, e.g. the error of its fixes or poses: what must be subtracted from them.
+    """A slow state of one sensor over time. The error of fixes or poses is to be subtracted from them.
 
     Attributes:
         name: what it is, for axis labels, e.g. 'GNSS error'.
@@ -75,7 +80,10 @@ class SlowEstimate:
     sigma: Array
 
     def surest(self, axes: Sequence[str]) -> Array | None:
-        """Return what some of its axes, constants, are (k,) where they are known best: each leg of a run learns them anew."""
+        """Return the values (k,) of some constant axes at the time at which they are known best; None where it lacks one of them.
+
+        They differ over a long run, because each leg estimates them anew.
+        """
         if not set(axes) <= set(self.axes):
             return None
         columns = [self.axes.index(axis) for axis in axes]
@@ -83,10 +91,10 @@ class SlowEstimate:
 
 
 class Graded(str):
-    """A warning whose figure each leg of a run finds for itself; a plain line to all who read it.
+    """A warning with a figure in it, which differs between the legs of a run; it reads as a plain line.
 
     Attributes:
-        about: what it says, whatever the figure. figure: the larger, the worse.
+        about: what the warning is about, the same in all legs. figure: the larger, the worse.
     """
 
     __slots__ = ("about", "figure")
@@ -94,7 +102,7 @@ class Graded(str):
     figure: float
 
     def __new__(cls, line: str, about: str = "", figure: float = 0.0) -> Self:
-        """Return the line; by default, for those who copy it, without what it is about."""
+        """Return the line. What copies a string gives the line alone, hence the defaults."""
         made = super().__new__(cls, line)
         made.about, made.figure = about, figure
         return made
@@ -105,14 +113,14 @@ class SolveStats:
     """How the solver fared.
 
     Attributes:
-        passes: outer passes (re-linearised carries, weights, modes) over the whole run.
+        passes: outer passes over the whole run; each chooses weights and modes anew.
         iterations: iterations of the non-linear solver, all passes and windows together.
         states: poses in the graph; factors: factors in the graph.
-        cost: 2 x final weighted cost, less that of outliers (a chi-square if the model holds); expected_cost: its degrees of
+        cost: 2 x the final weighted cost without that of outliers: a chi-square if the model holds. expected_cost: its degrees of
             freedom.
         converged: whether the last pass moved no state noticeably.
         warnings: one line each, for the report.
-        online: each pose is as it was known then; passes, factors and cost say nothing.
+        online: whether each pose is as it was known at its time; passes, factors and cost then mean nothing.
         events: what happened on the way: online, or that a long run was solved in legs.
     """
 
@@ -139,14 +147,14 @@ class Solution:
         accel_bias_mps2, gyro_bias_radps: (N, 3) in IMU axes.
         gyro_radps: (N, 3) angular rate of the body, body axes, bias removed. gyro_cov: (N, 3, 3) of it, rad^2/s^2.
         health, health_reason: N each.
-        since_agreed_s: per absolute sensor, (N,) s since it last agreed (inf: never).
-        slow: slow states by sensor.
-        berths: the vessel seen from each berth, where it is near.
+        since_agreed_s: by absolute sensor, (N,) s since it last agreed (inf: never).
+        slow: slow states, by sensor.
+        berths: the vessel seen from each berth that it comes near.
         ledger: every message of the run.
         stats: how the solver fared.
-        offsets: what the run says of levers, mounts and stamps; None where it was not asked.
+        offsets: what the run says of lever arms, mounts and stamps; None where that was not computed.
         time_offsets_s: by sensor, what is to be added to its stamps beyond the configured offset, s, where the run estimates it.
-        antennas_off_m: by receiver, how far its antenna is from where it is taken to sit (3,), body axes, where the run estimates it.
+        antennas_off_m: by receiver, estimated place of its antenna less the configured one (3,), body axes, where the run estimates it.
         doubts: why no pose is called good.
     """
 
@@ -175,7 +183,7 @@ class Solution:
         return "graphloc online" if self.stats.online else "graphloc"
 
     def doubted(self, why: str) -> Solution:
-        """Return it with no pose called good."""
+        """Return the solution with no pose's health good; `why`: a sentence."""
         good = [health is Health.GOOD for health in self.health]
         doubt = HealthReason(why, Cause.CONTRADICTION)
         return replace(

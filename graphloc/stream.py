@@ -29,13 +29,9 @@ from graphloc.measurements import ImuSample, Measurement
 from graphloc.online import OnlineSmoother
 from graphloc.origin import refuse_world_without_datum
 from graphloc.plain import plain
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, seconds_text
 
 log = logging.getLogger(__name__)
-
-
-def _stamp_text(stamp_ns: int) -> str:
-    return f"{stamp_ns // NS_PER_S}.{stamp_ns % NS_PER_S:09d}"
 
 
 def _place(p_m: Array, R: Array) -> dict[str, object]:
@@ -48,7 +44,7 @@ def as_json(estimate: Estimate, datum: Datum) -> dict[str, object]:
     roll, pitch, _ = np.degrees(rpy_from_rotation(estimate.R_world_body)).tolist()
     told = {
         "type": "estimate",
-        "stamp": _stamp_text(estimate.stamp_ns),
+        "stamp": seconds_text(estimate.stamp_ns),
         "stamp_ns": estimate.stamp_ns,
         "lat_deg": lat,
         "lon_deg": lon,
@@ -73,7 +69,7 @@ def as_json(estimate: Estimate, datum: Datum) -> dict[str, object]:
 
 
 class Smoother(Protocol):
-    """What a stream asks of an `OnlineSmoother`, whose docstrings hold."""
+    """The part of an `OnlineSmoother` that a stream uses; docstrings are there."""
 
     @property
     def waiting_for(self) -> str: ...  # noqa: D102
@@ -87,7 +83,7 @@ class Smoother(Protocol):
 
 
 class _Session:
-    """What goes out, and what was counted."""
+    """Writes the lines that go out, and counts ledger rows."""
 
     def __init__(self, out: TextIO, smoother: Smoother, ledger: bool) -> None:
         self._out, self._smoother, self._ledger = out, smoother, ledger
@@ -140,7 +136,7 @@ def run(
 
     Args:
         rate_hz: estimates a second, predicted at stamps of IMU samples; None: one at each new state.
-        ledger: write rows of the ledger as they become final.
+        ledger: whether to write ledger rows as they become final.
     """
     session = _Session(out, smoother, ledger)
     session.news()

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many runs: scenarios and seeds, or bags, with parameters varied; each in a process of its own, on Dask.
 
-A finished run is a line of `runs.jsonl`, so a sweep that was stopped goes on where it was. What a run gives
-does not depend on how many workers there are: each computes on one thread. (The online mode differs by some 1e-11 from
-run to run by itself.)
+A finished run is a line of `runs.jsonl`, so a sweep that was stopped can be continued. The result of a run does not depend on the number
+of workers, because each computes on one thread. (The online mode differs by some 1e-11 from run to run by itself.)
 """
 
 from __future__ import annotations
@@ -49,15 +48,15 @@ def sweep(
     A run that failed in an earlier start is tried again.
 
     Args:
-        jobs: what to run. folder: of the sweep; one that was begun with other jobs keeps what they share.
-        workers: processes on this machine; where a `scheduler` (tcp://host:port) is given, its workers are taken.
-        overwrite: begin anew. progress: told of runs done and in all.
+        jobs: what to run. folder: of the sweep; if it was begun with other jobs, the runs of jobs in both are kept.
+        workers: number of processes on this machine; if a `scheduler` (tcp://host:port) is given, its workers are used instead.
+        overwrite: whether to begin anew. progress: called with the number of runs done, and of all.
 
     Returns:
         The table's rows, in the order of the jobs.
 
     Raises:
-        GraphlocError: what `check` finds, a folder that is not to be used, a scheduler that is not there.
+        GraphlocError: as of `check`; a folder that cannot be used; a scheduler that does not answer.
     """
     need("distributed", "sweep")
     need("pyarrow", "sweep")
@@ -84,7 +83,7 @@ def sweep(
 
 
 def _inputs(jobs: Sequence[Job], folder: Path, overwrite: bool) -> dict[str, str]:
-    """Return the hashes of all inputs, those of a sweep that is gone on with among them; refuse a folder that is not to be used."""
+    """Return the hashes of all inputs, with those of a sweep that is continued; refuse a folder that cannot be used."""
     paths = sorted({path for job in jobs for path in (job.bag, job.config) if path})
     hashes = {path: app.sha256(Path(path)) for path in paths}
     mark = folder / MARK
@@ -102,7 +101,7 @@ def _inputs(jobs: Sequence[Job], folder: Path, overwrite: bool) -> dict[str, str
 
 
 def _begin(folder: Path, hashes: Mapping[str, str], overwrite: bool) -> None:
-    """Make the folder, or say in it what it goes on with."""
+    """Make the folder, or write into it what it is continued with."""
     mark = folder / MARK
     try:
         if folder.exists() and (overwrite or not mark.exists()):

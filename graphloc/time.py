@@ -18,7 +18,7 @@ class _Stamped(Protocol):
 
 NS_PER_S = 1_000_000_000
 GPS_AHEAD_S = 18.0
-"""GPS time is ahead of UTC by, since 2017."""
+"""Seconds by which GPS time is ahead of UTC since 2017: the leap seconds since 1980."""
 
 
 def seconds_between(start_ns: int, stop_ns: int) -> float:
@@ -41,11 +41,17 @@ def duration_ns(duration_s: float) -> int:
     return round(duration_s * NS_PER_S)
 
 
+def seconds_text(stamp_ns: int) -> str:
+    """Return a stamp as seconds since the epoch with all nine decimals, e.g. `1432235497.988949113`."""
+    whole, rest = divmod(stamp_ns, NS_PER_S)
+    return f"{whole}.{rest:09d}"
+
+
 def utc_text(stamp_ns: int) -> str:
     """Return a stamp as ISO 8601 UTC with all nine decimals, e.g. `2015-05-21T19:11:37.988949113Z`."""
     whole, rest = divmod(stamp_ns, NS_PER_S)
     try:
         text = datetime.fromtimestamp(whole, UTC).strftime("%Y-%m-%dT%H:%M:%S")
     except (OverflowError, ValueError, OSError):
-        return f"{whole}.{rest:09d}s"
+        return f"{seconds_text(stamp_ns)}s"
     return f"{text}.{rest:09d}Z"

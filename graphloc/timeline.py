@@ -19,7 +19,7 @@ from graphloc.config import TimelineConfig
 from graphloc.measurements import Measurement
 from graphloc.time import duration_ns
 
-_SNAP = 0.4  # of a period: two neighbours can never meet
+_SNAP = 0.4  # share of a period by which a state moves at most, so that two neighbours never meet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +27,7 @@ class Timeline:
     """Stamps of the states and of the slow nodes.
 
     Attributes:
-        stamps_ns: (N,) states. slow_of: (N,) slow node of each state. slow_stamps_ns: (M,).
+        stamps_ns: (N,) of the states. slow_of: (N,) slow node of each state. slow_stamps_ns: (M,) of the slow nodes.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -44,7 +44,7 @@ class Timeline:
         return left if stamp_ns - self.stamps_ns[left] <= self.stamps_ns[right] - stamp_ns else right
 
     def floor(self, stamp_ns: int) -> int:
-        """Return the last state at or before a stamp (the first one for stamps before it)."""
+        """Return the last state at or before a stamp; the first state, if the stamp is before all."""
         return max(int(np.searchsorted(self.stamps_ns, stamp_ns, side="right")) - 1, 0)
 
 

@@ -15,7 +15,7 @@ from graphloc.frames import Array, rpy_from_rotation, yaw_from_rotation
 from graphloc.signals.series import interpolated
 from graphloc.time import seconds_since
 
-_MOST_APART_S = 1.0  # poses between which the vessel is taken for known
+_MOST_APART_S = 1.0  # most time between two poses with which the trajectory between them counts as known
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,7 +28,7 @@ class Trajectory:
         R_world_body: (N, 3, 3).
         v_world_mps: (N, 3), or None where velocity is not known (then interpolation is linear).
         cov: (N, 6, 6) or None: x, y, z (m) and small rotations (rad), all about the world's axes.
-        planar: height, roll and pitch are not estimated.
+        planar: whether height, roll and pitch are not estimated.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -59,7 +59,7 @@ class Trajectory:
         return yaw_from_rotation(self.R_world_body)
 
     def where(self, kept: NDArray[np.bool_] | slice) -> Trajectory:
-        """Return some of its poses: (N,) which, or a slice."""
+        """Return some of its poses; `kept`: (N,) whether each is kept, or a slice."""
         return replace(
             self,
             stamps_ns=self.stamps_ns[kept],
@@ -78,17 +78,17 @@ class Trajectory:
         return np.asarray(inside & (gap <= _MOST_APART_S))
 
     def _around(self, stamps: NDArray[np.int64]) -> slice:
-        """Which poses interpolation at these stamps uses."""
+        """Return the poses that interpolation at these stamps needs."""
         if not len(stamps):
             return slice(None)
         first = int(np.searchsorted(self.stamps_ns, stamps.min(), side="right")) - 2
         return slice(max(first, 0), int(np.searchsorted(self.stamps_ns, stamps.max(), side="left")) + 2)
 
     def at(self, stamps_ns: NDArray[np.int64]) -> Trajectory:
-        """Return the trajectory at M stamps inside its span (cubic Hermite in position, slerp in attitude).
+        """Return the trajectory at M stamps inside its span: position by cubic Hermite splines, attitude by slerp.
 
-        Velocities are the derivative of the position. Covariances are linear in between as the position is, and so never
-        too small where an estimate jumps: the nearest one alone, after an outage, was that of the fix for a place halfway.
+        Velocity is the derivative of the position. Without velocities, position is linear. Covariances are linear between two poses. If that
+        of the nearest pose were taken, a place halfway through an outage would have the small covariance of the fix that ends it.
         """
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         if len(stamps) and (stamps[0] < self.stamps_ns[0] or stamps[-1] > self.stamps_ns[-1]):
@@ -118,7 +118,7 @@ class Trajectory:
         )
 
     def poses_at(self, stamps_ns: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Return positions (M, 3) and rotations (M, 3, 3) at M stamps inside its span, in any order, several of which may be equal."""
+        """Return positions (M, 3) and rotations (M, 3, 3) at M stamps inside its span; these may be in any order, and repeat."""
         moments, index = np.unique(stamps_ns, return_inverse=True)
         there = self.at(moments)
         return there.p_world_m[index], there.R_world_body[index]
@@ -127,7 +127,7 @@ class Trajectory:
 def bounds_95(cov: Array) -> Array:
     """95 % bounds (N, 3) of covariances (N, 6, 6) as a `Trajectory` has them: horizontal radius m, height m, heading deg.
 
-    The radius is the semi-major axis of the 95 % ellipse; so it holds at least 95 %.
+    The radius is the semi-major axis of the 95 % ellipse, so the circle holds at least 95 %.
     """
     major = np.linalg.eigvalsh(cov[:, :2, :2])[:, -1]
     return np.column_stack(

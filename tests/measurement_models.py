@@ -33,8 +33,8 @@ class Situation(NamedTuple):
     """Where the vessel is and how it moves, with symbols of docs/measurement-models.md.
 
     Attributes:
-        R, p, v: of body in world, v at the measurement. omega: body rate. felt: by the IMU.
-        l: lever arm. l_then, M: place and rotation of the sensor at the measurement, seen from the body at the state.
+        R, p, v: of body in world, p and v at the measurement. omega: body rate. felt: by the IMU.
+        l: lever arm. l_then, M: place and rotation of the sensor, turned as at the measurement, seen from the body at the state.
         off: slow state by the names and in the units of outputs, constants by the key that they are added to; 0 where there is none.
         of_tags: (6,) survey error of each tag. latitude_rad: of the datum.
     """
@@ -63,7 +63,7 @@ class Situation(NamedTuple):
             off |= zip(constant.corrects, value.tolist(), strict=bool(constant.corrects))
         assert at.felt is not None
         return cls(
-            at.T_world_body.rotation().matrix(), at.T_world_body.translation(), at.v_world_mps + at.dv_world_mps, at.gyro_radps,
+            at.T_world_body.rotation().matrix(), at.T_world_body.translation() + at.carried_m, at.v_world_mps + at.dv_world_mps, at.gyro_radps,
             at.lever_m, at.T_state_sensor.translation(), at.T_state_sensor.rotation().matrix(), at.felt, off, values,
             np.radians(at.datum.origin.latitude_deg),
         )  # fmt: skip

@@ -64,7 +64,7 @@ def attached(T: Any, slow_value: Array | None = None) -> Attachment:
     zero = np.zeros(3)
     return Attachment(
         pose_key=1, velocity_key=2, slow_key=None if slow_value is None else 3, leaf_keys=(4, 5), T_world_body=T,
-        v_world_mps=zero, T_state_sensor=gtsam.Pose3(), dv_world_mps=zero, gyro_radps=zero, lever_m=zero,
+        v_world_mps=zero, T_state_sensor=gtsam.Pose3(), carried_m=zero, dv_world_mps=zero, gyro_radps=zero, lever_m=zero,
         slow_value=slow_value, datum=Datum(Geodetic(59.0, 18.0, 0.0)),
     )  # fmt: skip
 

@@ -134,7 +134,7 @@ def test_a_residual_by_hand() -> None:
     at = Attachment(
         pose_key=1, velocity_key=2, slow_key=3, leaf_keys=(4, 5), T_world_body=gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2), np.zeros(3)),
         v_world_mps=np.array([0.0, 2.0, 0.0]), T_state_sensor=gtsam.Pose3(gtsam.Rot3(), np.array([3.0, 0.0, 0.0])),
-        dv_world_mps=np.zeros(3), gyro_radps=np.array([0.0, 0.0, 0.1]), lever_m=np.array([3.0, 0.0, 0.0]),
+        carried_m=np.zeros(3), dv_world_mps=np.zeros(3), gyro_radps=np.array([0.0, 0.0, 0.1]), lever_m=np.array([3.0, 0.0, 0.0]),
         slow_value=np.array([0.04, 0.0, 0.5]), datum=Datum(Geodetic(59.3, 18.1, 20.0)),
     )  # fmt: skip
     m = BodyVelocity(stamp_ns=0, sensor="log", seq=0, axes=("x", "y"), value=np.array([1.0, 0.1]), cov=np.eye(2) * 0.01)

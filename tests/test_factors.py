@@ -50,6 +50,7 @@ def attachment(row: Sensor, config: object, *, tilt: float = 0.1, far_m: float =
         ),
         v_world_mps=RNG.normal(0, 2, 3),
         T_state_sensor=gtsam.Pose3(gtsam.Rot3.RzRyRx(0.02, -0.03, 0.4), np.array([-1.5, 0.4, 2.2])),
+        carried_m=np.array([0.3, -0.2, 0.05]),
         dv_world_mps=np.array([0.1, -0.05, 0.02]),
         gyro_radps=np.array([0.02, -0.01, 0.2]),
         lever_m=np.array([-1.5, 0.4, 2.2]),
@@ -216,7 +217,7 @@ def test_compass_sign_and_wrap() -> None:
     row = next(r for r in SENSORS if r.kind == "compass")
     config = row.config(kind="compass")
     at = replace(attachment(row, config, tilt=0.0, slow=False), T_state_sensor=gtsam.Pose3())
-    at = replace(at, T_world_body=gtsam.Pose3(gtsam.Rot3.Yaw(np.pi - 0.01), np.zeros(3)))
+    at = replace(at, T_world_body=gtsam.Pose3(gtsam.Rot3.Yaw(np.pi - 0.01), np.zeros(3)), carried_m=np.zeros(3))
     m = replace(cast(CompassHeading, row.ideal(at, config)), yaw_rad=-np.pi + 0.01)  # 0.02 rad further, across the wrap
     assert row.residuals(m, config, at)[0].raw[0] == pytest.approx(-0.02)
 
@@ -341,7 +342,11 @@ def test_hints_say_what_the_state_says(row: Sensor) -> None:
     config = config_of(row)
     at = attachment(row, config, tilt=0.0, slow=False)
     at = replace(
-        at, T_state_sensor=gtsam.Pose3(gtsam.Rot3.Yaw(0.4), np.zeros(3)), lever_m=np.zeros(3), dv_world_mps=np.zeros(3)
+        at,
+        T_state_sensor=gtsam.Pose3(gtsam.Rot3.Yaw(0.4), np.zeros(3)),
+        lever_m=np.zeros(3),
+        dv_world_mps=np.zeros(3),
+        carried_m=np.zeros(3),
     )
     hint = row.hint(row.ideal(at, config), 0.4, DATUM)
     truth = at.T_world_body.translation()

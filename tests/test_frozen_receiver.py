@@ -18,6 +18,7 @@ from graphloc.measurements import GnssPosition, PoseFix
 from graphloc.online._repeated_fix import RepeatedFixDetector
 from graphloc.online._repeated_velocity import RepeatedVelocityDetector
 from graphloc.signals.frozen_receiver import frozen_fixes, frozen_velocities
+from graphloc.signals.series import line_fit
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag
 from tests.slowly import simulate_slowly
 
@@ -229,6 +230,17 @@ def velocities(hz: float, held_s: tuple[float, float], *, rounded_mps: float = 0
     held = (t >= held_s[0]) & (t < held_s[1])
     v[held] = v[np.argmax(held)] * moving
     return t, START_NS + np.round(t * S).astype(np.int64), v
+
+
+def test_a_line_is_fitted_as_by_least_squares() -> None:
+    """Normal equations solved for each axis: slope, residuals, and the slope's sigma for values good to 1."""
+    rng = np.random.default_rng(4)
+    t, places = rng.uniform(100.0, 130.0, 20), rng.normal(0.0, 5.0, (20, 2))
+    A = np.column_stack([np.ones(20), t])
+    found = line_fit(t, places)
+    assert found.slope == pytest.approx(np.linalg.lstsq(A, places)[0][1])
+    assert found.left == pytest.approx(places - A @ np.linalg.lstsq(A, places)[0])
+    assert found.sigma == pytest.approx(np.sqrt(np.linalg.inv(A.T @ A)[1, 1]))
 
 
 @pytest.mark.parametrize("hz", [2.0, 10.0])

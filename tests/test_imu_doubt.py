@@ -17,7 +17,7 @@ from graphloc.errors import SolveError
 from graphloc.eval.metrics import TrackErrors, errors
 from graphloc.factors.imu import ROW
 from graphloc.frames import Array
-from graphloc.graph import Going
+from graphloc.inertial import GapMotion
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, ImuSeries, Measurement
 from graphloc.online import _lag
@@ -351,7 +351,7 @@ def test_samples_that_are_left_out_are_a_gap_however_short() -> None:
     links, bias = ROW.link(imu, ImuConfig(), np.eye(3), 9.81), gtsam.imuBias.ConstantBias()
 
     def turn(from_ns: int, to_ns: int) -> tuple[float, float]:
-        pim = links.integrate(from_ns, to_ns, bias, Going(bias, np.zeros(3)))
+        pim = links.integrate(from_ns, to_ns, bias, GapMotion(bias, np.zeros(3)))
         return float(gtsam.Rot3.Logmap(pim.deltaRij())[2]), float(np.sqrt(pim.preintMeasCov()[2, 2]))
 
     assert turn(5 * S, 6 * S)[0] == pytest.approx(0.1 + 6.9 * 0.25, abs=0.1)

@@ -17,7 +17,7 @@ from graphloc.eval.simulate import Scenario
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.factors.imu import ROW
 from graphloc.frames import Array
-from graphloc.graph import Going, InertialLink
+from graphloc.inertial import GapMotion, InertialLink
 from graphloc.measurements import ImuSeries, Measurement
 from tests.faults import arrivals_of, feed, numbered
 from tests.slowly import simulate_slowly
@@ -123,7 +123,7 @@ def test_a_bias_that_is_known_is_taken_off_once() -> None:
     imu = imu_of(gyro, accel + np.array([0.2, 0.0, 0.0]), (15.0, 28.0), UPRIGHT)
     start = gtsam.NavState(gtsam.Pose3(), np.array([3.0, 0.0, 0.0]))
     for about in (known, BIAS):  # as an answer is given, and as a link is laid
-        pim = ROW.link(imu, ImuConfig(), UPRIGHT, G).integrate(15 * S, 28 * S, about, Going.of(start, known))
+        pim = ROW.link(imu, ImuConfig(), UPRIGHT, G).integrate(15 * S, 28 * S, about, GapMotion.of(start, known))
         there = pim.predict(start, known)
         assert there.velocity() == pytest.approx(np.array([3.0, 0.0, 0.0]), abs=1e-6)
         assert there.position() == pytest.approx(np.array([39.0, 0.0, 0.0]), abs=1e-5)
@@ -139,7 +139,7 @@ def test_who_turns_goes_round(rpy: tuple[float, float, float], from_s: float) ->
     known = gtsam.imuBias.ConstantBias(R.T @ [0.1, 0.2, -0.1], R.T @ [0.01, -0.02, 0.015])
     imu = imu_of(gyro + R @ known.gyroscope(), accel + R @ known.accelerometer(), (15.0, 28.0), R)
     start = gtsam.NavState(gtsam.Pose3(gtsam.Rot3.Yaw(0.7), np.zeros(3)), gtsam.Rot3.Yaw(0.7).rotate([3.0, 0.0, 0.0]))
-    pim = ROW.link(imu, ImuConfig(), R, G).integrate(int(from_s * S), 28 * S, BIAS, Going.of(start, known))
+    pim = ROW.link(imu, ImuConfig(), R, G).integrate(int(from_s * S), 28 * S, BIAS, GapMotion.of(start, known))
     turned = 0.2 * (28.0 - from_s)
     round_it = gtsam.Rot3.Yaw(0.7).rotate(15.0 * np.array([np.sin(turned), 1.0 - np.cos(turned), 0.0]))
     there = pim.predict(start, known)

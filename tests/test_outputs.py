@@ -34,6 +34,8 @@ def written(out: Path, origin: Geodetic) -> Path:
     stamps = START_NS + 100_000_000 * np.arange(n, dtype=np.int64)
     R = Rotation.from_euler("ZYX", [YAW, PITCH, ROLL]).as_matrix()
     p = np.array([100.0, -40.0, 3.0]) + np.arange(n)[:, None] * V * 0.1
+    cov = np.tile(COV, (n, 1, 1))
+    cov[18, 5, 5], cov[19, 0, 0] = 1.0, 11.0**2  # heading and place are lost: 95 % bounds of 112 deg and 27 m
     solution = Solution(
         datum=Datum(origin),
         trajectory=Trajectory(
@@ -41,15 +43,19 @@ def written(out: Path, origin: Geodetic) -> Path:
             p_world_m=p,
             R_world_body=np.tile(R, (n, 1, 1)),
             v_world_mps=np.tile(V, (n, 1)),
-            cov=np.tile(COV, (n, 1, 1)),
+            cov=cov,
         ),
         v_cov=np.tile(np.diag([0.01, 0.02, 0.03]), (n, 1, 1)),
         accel_bias_mps2=np.zeros((n, 3)),
         gyro_bias_radps=np.zeros((n, 3)),
         gyro_radps=np.tile([0.01, 0.02, 0.03], (n, 1)),
         gyro_cov=np.tile(np.diag([1e-5, 2e-5, 3e-5]), (n, 1, 1)),
-        health=(Health.GOOD,) * 19 + (Health.LOST, Health.DEGRADED),
-        health_reason=(HealthReason(),) * 19 + (HealthReason("nothing", Cause.SENSORS), HealthReason("gnss missing", Cause.SENSORS, ("gnss",)),),
+        health=(Health.GOOD,) * 18 + (Health.LOST, Health.LOST, Health.DEGRADED),
+        health_reason=(
+            *(HealthReason(),) * 18,
+            *(HealthReason("nothing", Cause.HEADING), HealthReason("nothing", Cause.BOUND)),
+            HealthReason("gnss missing", Cause.SENSORS, ("gnss",)),
+        ),
         since_agreed_s={"gnss": np.asarray(np.arange(n) * 0.5, dtype=np.float64)},
         slow={
             "gnss": SlowEstimate(

@@ -13,7 +13,7 @@ from graphloc.config import ImuConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.factors.imu import ROW
 from graphloc.frames import Array
-from graphloc.graph import Going
+from graphloc.inertial import GapMotion
 from graphloc.measurements import ImuSeries
 from graphloc.signals.pauses import Stamps, common_pauses
 from tests.bagfactory import START_NS, Messages
@@ -82,7 +82,7 @@ def test_across_a_pause_a_vessel_may_not_have_moved() -> None:
     )  # fmt: skip
     links = ROW.link(imu, ImuConfig(), np.eye(3), G)
     bias = gtsam.imuBias.ConstantBias()
-    going = Going(bias, np.array([0.0, 3.0, 0.0]))
+    going = GapMotion(bias, np.array([0.0, 3.0, 0.0]))
 
     def sigmas(from_s: float, to_s: float) -> Array:
         pim = links.integrate(int(from_s * S), int(to_s * S), bias, going)

@@ -14,7 +14,7 @@ from graphloc.frontends._clock import ClockStep, gain, leaps
 from graphloc.frontends.inspect import draft_config
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition
-from graphloc.time import duration_ns, utc_text
+from graphloc.time import duration_ns, seconds_text, utc_text
 from tests.bagfactory import START_NS, Item, Messages, S
 from tests.heldbags import hold_bag, inspect_bag, read_recording
 from tests.test_bag_bad_input import accounted, vessel
@@ -357,3 +357,10 @@ def test_sensors_whose_clock_is_set_are_judged_on_one_side_of_it(learned_s: int,
         assert any("from GPS time to UTC" in w for w in found.warnings) == (name == "set")
         seen.append((found.compasses[0].samples, found.imus[0].mount.evidence))
     assert seen[0] == seen[1]
+
+
+def test_stamps_as_text_keep_each_nanosecond() -> None:
+    """19:11:37 UTC on 21 May 2015 is 1432235497 s; what no calendar has is said in seconds."""
+    assert seconds_text(1_432_235_497_088_949_113) == "1432235497.088949113"
+    assert utc_text(1_432_235_497_088_949_113) == "2015-05-21T19:11:37.088949113Z"
+    assert utc_text(10**21 + 5) == "1000000000000.000000005s"

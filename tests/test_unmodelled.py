@@ -155,7 +155,7 @@ def test_an_antenna_of_unknown_place_stays_where_it_is_found(monkeypatch: pytest
 
 
 def test_online_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without it, the mean squares are 1.8 and 3; linear in the heading, it is rather too wide than too narrow."""
+    """Without it, the mean squares are 1.8 and 3; linear in the heading, it is rather too wide than too narrow (of some four degrees of freedom)."""
     monkeypatch.setattr(_waiting, "_TRY_EVERY_S", 15.3)  # each try solves all that there is
     monkeypatch.setattr(_waiting, "_TRY_AGAIN", 0.0)
     found = []
@@ -163,8 +163,8 @@ def test_online_too(monkeypatch: pytest.MonkeyPatch) -> None:
         run, recording, config = drifting(seed, 0.5)
         found.append(squares(app.replay_recording(recording, with_few_states(config, 5.0)).solution, run))
     heading, velocity = np.mean([h.mean() for h, _ in found]), np.mean([v.mean() for _, v in found])
-    assert 0.3 < heading < 1.5
-    assert 0.3 < velocity < 1.3
+    assert 0.1 < heading < 1.0
+    assert 0.3 < velocity < 1.1
 
 
 def test_what_a_drift_did_to_the_velocity_is_in_the_bounds_of_a_place_without_fixes() -> None:
@@ -183,8 +183,8 @@ def test_what_a_drift_did_to_the_velocity_is_in_the_bounds_of_a_place_without_fi
         squares_off = off_m**2 / np.diagonal(track.cov[inside], axis1=1, axis2=2)[:, :2]
         found.append([squares_off[since_s[inside] < 30.0].mean(), squares_off[since_s[inside] > 40.0].mean()])
     soon, later = np.mean(found, axis=0)
-    assert 0.1 < soon < 2.0
-    assert 0.3 < later < 2.0
+    assert 0.1 < soon < 1.0
+    assert 0.15 < later < 1.0
 
 
 @pytest.mark.parametrize("solve", [app.smooth_recording, app.replay_recording], ids=["offline", "online"])

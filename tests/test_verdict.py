@@ -18,7 +18,7 @@ from graphloc.eval.report._track_verdict import _late_velocity, main_table
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import GnssPosition
-from graphloc.signals.frozen_receiver import WHY
+from graphloc.signals.frozen_receiver import FROZEN_FIX
 from graphloc.solution import Cause, Health, HealthReason, Solution
 from graphloc.solve.health import health_of
 from graphloc.trajectory import Trajectory
@@ -268,10 +268,13 @@ def test_when_it_was_less_than_good(data: ReportData) -> None:
 
 
 def test_what_would_end_it_is_reported_of_the_cause() -> None:
-    known, unknown = np.eye(6) * 1e-4, np.eye(6) * 100.0
+    known, lost, turned = np.eye(6) * 1e-4, np.eye(6) * 200.0, np.diag([1e-2, 1e-2, 1e-2, 1e-4, 1e-4, 1.0])
     away = {"compass": 20.0, "gnss": 12.0, "match": 1.0}
     assert cure(*health_of(known, away, 2.5)).startswith("compass, gnss agreeing again")
-    assert "for the heading" in cure(*health_of(unknown, {"gnss": 1.0}, 2.5))
+    assert cure(*health_of(lost, {"gnss": 1.0}, 2.5)) == "a fix, match or tag that agrees"
+    health, why = health_of(turned, {"gnss": 1.0}, 2.5)
+    assert (health, why.text) == (Health.LOST, "heading unknown: 95 % bound 112 deg; that of the position 0.2 m")
+    assert cure(health, why).startswith("a compass, ")
     assert "fix" in cure(*health_of(known, {"gnss": 6.0}, 2.5))
     assert "second position sensor" in cure(*health_of(np.diag([4.0, 4.0, 1.0, 1e-4, 1e-4, 1e-4]), {"gnss": 1.0}, 2.5))
     assert "warnings" in cure(*health_of(known, {"gnss": 1.0}, 2.5, "the measurements contradict each other"))
@@ -306,7 +309,9 @@ def test_what_a_frozen_receiver_repeats_contradicts_nothing(data: ReportData) ->
     fixes = [m for m in data.recording.measurements if m.sensor == "gnss"]
     solution = replace(data.solution, trajectory=moved(data.solution.trajectory, 0.6, 30.0))
     repeated = {m.seq for m in fixes[: len(fixes) * 2 // 3]}
-    rows = [replace(r, reason=WHY, outcome=Outcome.REJECTED) if r.seq in repeated else r for r in solution.ledger]
+    rows = [
+        replace(r, reason=FROZEN_FIX, outcome=Outcome.REJECTED) if r.seq in repeated else r for r in solution.ledger
+    ]
     for ledger, trust in ((solution.ledger, Trust.NO), (Ledger(rows), Trust.YES)):
         found = verdict(replace(data, solution=replace(solution, ledger=ledger))).tracks[0]
         assert found.trust is trust

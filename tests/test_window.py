@@ -33,7 +33,7 @@ def drive(seed: int) -> list[Staged]:
             factors: list[Any] = [gtsam.BetweenFactorPose3(keys.pose(k - 1), keys.pose(k), told, STEP)]
         else:
             factors = [gtsam.PriorFactorPose3(keys.pose(0), true, FIRST)]
-        antenna, lever = keys.leaves(k)
+        antenna, lever = keys.leaves(0, k)
         fix = true.transformFrom(LEVER) + rng.normal(0.0, 0.3, 3)
         new = {keys.pose(k): guess, antenna: fix, lever: LEVER}
         if k == 0:
@@ -111,7 +111,7 @@ def test_a_leaf_whose_factors_are_taken_out_can_be_put_in_again() -> None:
         held = window.add(factors[-3:])
         window.commit()
         if k % HZ == 1:
-            antenna, lever = keys.leaves(k)
+            antenna, lever = keys.leaves(0, k)
             assert window.remove(held)
             window.relinearise()
             window.commit()

@@ -82,9 +82,9 @@ def cure(health: Health, reason: HealthReason) -> str:
     """Return what would end a state of health that is not good."""
     if reason.cause is Cause.GUESSED_HEADING:
         return "a heading sensor (compass, dual antenna), wheels or a log (body_velocity), or start.heading_deg"
-    if health is Health.LOST:
-        return "a fix, match or tag that agrees; for the heading, a compass, wheels or a log (body_velocity), or turns and changes of speed"
-    if health is Health.DEAD_RECKONING:
+    if reason.cause is Cause.HEADING:
+        return "a compass, wheels or a log (body_velocity), or turns and changes of speed"
+    if health in (Health.LOST, Health.DEAD_RECKONING):
         return "a fix, match or tag that agrees"
     if reason.cause is Cause.SENSORS:
         return f"{', '.join(reason.sensors)} agreeing again; the ledger says what became of its measurements"

@@ -21,6 +21,7 @@ _KNOWS = {
     "graphloc": "Offline, from the whole run (graphloc)",
     "graphloc online": "Online, as known at each time (graphloc online)",
 }
+_COLOUR = {Trust.YES: "#009E73", Trust.WITH_CARE: "#E69F00", Trust.NO: "#D55E00"}
 _CLASS = {Trust.YES: "", Trust.WITH_CARE: "care", Trust.NO: "no"}
 # What the first table says of each estimate, where a run has it: column, heading, digits.
 _KEY = (
@@ -41,7 +42,7 @@ def first_screen(data: ReportData, verdict: RunVerdict) -> str:
         said = track.trust.said
         named = f"{_KNOWS[track.name]}: {said}" if several else said.capitalize()
         boxes.append(
-            f'<div class="verdict" style="--trust:{track.trust.value}"><b>{escape(named)}.</b> {escape(track.accuracy)}</div>'
+            f'<div class="verdict" style="--trust:{_COLOUR[track.trust]}"><b>{escape(named)}.</b> {escape(track.accuracy)}</div>'
         )
         reasons = "".join(f'<li class="{_CLASS[r.trust]}">{escape(r.text)}</li>' for r in track.reasons)
         head = f"<h3>{escape(track.name)}: why</h3>" if several else ""

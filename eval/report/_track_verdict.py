@@ -24,35 +24,38 @@ from graphloc.solution import CONTRADICTING_COST, Health, Solution
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory, bounds_95
 
-# Shares of the run: called good, called lost, covered by the 95 % bounds, compared at all; beyond, a reader has to look closer.
-_MOSTLY, _LOST, _COVERED, _NOT_COVERED, _MATCHED, _STARTED = 0.5, 0.05, 0.85, 0.5, 0.95, 0.8
+# Shares of a run, beyond which a reader has to look closer; choices.
+_MOSTLY = 0.5  # less of it called good
+_LOST = 0.05  # more of it called lost
+_COVERED = 0.85  # less of the truth inside the 95 % bounds: they are too small
+_NOT_COVERED = 0.5  # less of it inside: no bound can be relied on
+_MATCHED = 0.95  # less of what the track is compared with, covered by it
+_STARTED = 0.8  # the same online, where the start waits for position and heading
 _TOO_SURE = 4.0  # NEES: errors are 1.4 times what the covariance says
 # Of the time in which online's 95 % bounds hold the offline position: that one is better informed, so honest ones do for 95 %.
 _HOLDS_OFFLINE = 0.9
 _PLACES = ("gnss", "pose", "aerial")
 _BESIDE_GNSS, _FEWEST_USED = ("pose", "aerial", "apriltag"), 10
-# Of a receiver from the track, beyond any multipath that lasts; and in sigmas of its slow error.
-_APART_M, _APART_SIGMAS = 20.0, 5.0
+# Of a receiver from the track, for half of its fixes or more.
+_APART_M = 20.0  # farther than any multipath that lasts
+_APART_SIGMAS = 5.0  # of its slow error, where that is configured larger
 _STAYS = 0.5  # what of an error changes, as a share of what stays, up to which the latter is said to be wrong; a choice
 # Shares of what is compared that two tracks cover, apart by at most so much, so that a ratio says something; online starts seconds later.
 _ALIKE = 0.1
 _WORSE = 1.05  # times a filter's error, from which on ours is said to be larger
 
 
-class Trust(enum.StrEnum):
-    """Level of trust; its value is the colour in the report."""
+class Trust(enum.IntEnum):
+    """Level of trust, the highest first."""
 
-    YES = "#009E73"
-    WITH_CARE = "#E69F00"
-    NO = "#D55E00"
+    YES = 0
+    WITH_CARE = 1
+    NO = 2
 
     @property
     def said(self) -> str:
         """The level in words."""
         return {Trust.YES: "can be trusted", Trust.WITH_CARE: "use with care", Trust.NO: "do not rely on it"}[self]
-
-
-_ORDER = (Trust.YES, Trust.WITH_CARE, Trust.NO)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,7 +87,7 @@ class TrackVerdict:
 
 def worst(of: Iterator[Trust]) -> Trust:
     """Return the lowest of some levels of trust."""
-    return max(of, key=_ORDER.index, default=Trust.YES)
+    return max(of, default=Trust.YES)
 
 
 def track_verdict(data: ReportData, solution: Solution) -> TrackVerdict:
@@ -126,10 +129,8 @@ def _coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
         return
     trust, why = Trust.YES, ""
     if covered < _NOT_COVERED:
-        trust, why = (
-            Trust.NO,
-            _constant(data, solution) or ". The bounds are far too small: a mount, the datum or a noise is wrong",
-        )
+        trust = Trust.NO
+        why = _constant(data, solution) or ". The bounds are far too small: a mount, the datum or a noise is wrong"
     elif covered < _COVERED or (nees is not None and nees > _TOO_SURE):
         trust, why = Trust.WITH_CARE, _constant(data, solution) or "; they are too small"
     beside = "" if nees is None else f" (NEES {nees:.1f}; 2 where they are honest)"

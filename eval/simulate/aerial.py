@@ -37,6 +37,7 @@ _SURFACES = {
 }  # fmt: skip
 _WATER, _WATER_NOISE = (38, 62, 72), 6.0
 _KERB_M = 0.35
+_SHIFT_SIGMA_M = 0.3  # of the misregistration, east and north: the default of `image_sigma_m`: what a vessel.yaml states by default holds
 
 
 class _Season(NamedTuple):
@@ -110,7 +111,7 @@ def _to_grid(epsg: int) -> Transformer:
     return Transformer.from_crs(CRS.from_epsg(4326), CRS.from_epsg(epsg), always_xy=True)
 
 
-def render(harbour: Harbour, seed: int, pixel_m: float = 0.16, shift_sigma_m: float = 0.3) -> RenderedImage:
+def render(harbour: Harbour, seed: int, pixel_m: float = 0.16) -> RenderedImage:
     """Take the image of a harbour: its own day, sun, boats and misregistration, from `seed`."""
     rng = np.random.default_rng([seed, 11])
     west, south, east, north = harbour.config.image_m
@@ -118,7 +119,7 @@ def render(harbour: Harbour, seed: int, pixel_m: float = 0.16, shift_sigma_m: fl
     corners = grid_from_enu(harbour.datum, epsg, np.array([(west, south), (west, north), (east, south), (east, north)]))
     left, top = float(np.floor(corners[:, 0].min())), float(np.ceil(corners[:, 1].max()))
     columns, rows = (int(np.ceil(v / pixel_m)) for v in (corners[:, 0].max() - left, top - corners[:, 1].min()))
-    shift = rng.normal(0.0, shift_sigma_m, 2)
+    shift = rng.normal(0.0, _SHIFT_SIGMA_M, 2)
     season = _SEASONS[rng.integers(len(_SEASONS))]
     pen = _Pen(
         rng, harbour.datum, epsg, left, top, pixel_m / _FINE, (rows * _FINE, columns * _FINE), shift, season.water

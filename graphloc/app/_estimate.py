@@ -33,7 +33,7 @@ from graphloc.replay import Status, replay, silent
 from graphloc.signals.frozen_receiver import without_frozen_fixes
 from graphloc.solution import Solution
 from graphloc.solve import smooth
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, duration_ns
 
 _MOST_GROWN = 8  # times that scans are matched around what those within reach lead to: each carries it on for some 20 s
 _GAINS = 0.9  # of those beyond reach, that may be left for it to be worth its time
@@ -313,7 +313,7 @@ def match_at(
     span_s = (int(track.stamps_ns[-1]) - int(track.stamps_ns[0])) / 1e9
     if not 0.0 <= at_s <= span_s:
         raise InputError(f"{recording.source}: --at {at_s:g}: the run is from 0 to {span_s:.1f} s")
-    at_ns = int(track.stamps_ns[0]) + round(at_s * 1e9)
+    at_ns = int(track.stamps_ns[0]) + duration_ns(at_s)
     found = match_bag(scans.bags, sensor, scans.folder, config.body_frame, track, datum, at_ns=at_ns)
     item = next(found, None)
     if item is None or item.match is None:
@@ -323,9 +323,9 @@ def match_at(
     return item.match, item.stamp_ns
 
 
-def simulated(run: SimulatedRun, *, compare: bool = False, progress: Progress = quiet) -> Run:
+def simulated(run: SimulatedRun, *, compare: bool = False) -> Run:
     """Smooth a simulated run."""
-    return smooth_recording(run.recording, run.config, compare=compare, progress=progress)
+    return smooth_recording(run.recording, run.config, compare=compare)
 
 
 def choose_datum(recording: Recording, config: VesselConfig) -> Datum:

@@ -26,6 +26,7 @@ from graphloc.build._attach import (
 from graphloc.build._chains import (
     JUMP,
     SPACED_BY,
+    allowed_jump_m,
     at_level,
     bias_step,
     closing_variance,
@@ -93,6 +94,7 @@ __all__ = [
     "StartPrior",
     "Stream",
     "Thinned",
+    "allowed_jump_m",
     "asks_for_delay",
     "at_level",
     "attach",

@@ -13,10 +13,11 @@ from graphloc import keys
 from graphloc.build._chains import walk_between_nodes
 from graphloc.config import VesselConfig
 from graphloc.frames import Array, Datum
-from graphloc.graph import TIME_OFFSET, Attachment, Constant, FeltMotion, InertialLink, Sensor, SlowProcess
-from graphloc.measurements import Measurement
+from graphloc.graph import TIME_OFFSET, Attachment, Constant, FeltMotion, Sensor, SlowProcess
+from graphloc.inertial import InertialLink
+from graphloc.measurements import NO_HEIGHT_M2, Measurement
 
-_NO_HEIGHT_M2 = np.array([0.0, 0.0, 1e12])  # adds to a fix what leaves its height without weight
+_NO_HEIGHT_M2 = np.array([0.0, 0.0, NO_HEIGHT_M2])  # adds to a fix what leaves its height without weight
 
 Carry = tuple[int, Any]
 """Number of a state, and the motion preintegrated from there to a measurement."""
@@ -199,23 +200,25 @@ def attach(problem: Sited, stream: Attaching, i: int, values: Estimates) -> Atta
     T = values.atPose3(keys.pose(k))
     v = values.atVector(keys.velocity(k))
     bias = values.atConstantBias(keys.bias(j))
-    T_state_sensor, dv, carried_to = stream.mount, np.zeros(3), None
+    T_state_sensor, carried_m, dv, carried_to = stream.mount, np.zeros(3), np.zeros(3), None
     carried = stream.carry[i]
     if carried is not None:
         floor, pim = carried
         there = pim.predict(gtsam.NavState(T, v) if floor == k else nav_state(values, floor), bias)
         carried_to = T.between(there.pose())
-        T_state_sensor = carried_to.compose(stream.mount)
+        T_state_sensor = gtsam.Pose3(carried_to.rotation(), np.zeros(3)).compose(stream.mount)
+        carried_m = np.asarray(there.position()) - T.translation()
         dv = np.asarray(there.velocity()) - v
     slow_key = None if stream.slow is None else keys.slow(stream.number, j)
     return Attachment(
         pose_key=keys.pose(k),
         velocity_key=keys.velocity(k),
         slow_key=slow_key,
-        leaf_keys=keys.leaves(stream.number * 100_000_000 + i),
+        leaf_keys=keys.leaves(stream.number, i),
         T_world_body=T,
         v_world_mps=v,
         T_state_sensor=T_state_sensor,
+        carried_m=carried_m,
         dv_world_mps=dv,
         gyro_radps=stream.gyro_radps[i] - problem.R_body_imu @ bias.gyroscope(),
         lever_m=np.asarray(stream.mount.translation()),

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Factors of slowly varying states: IMU biases, and the slow errors of sensors.
 
-A slow error is a first-order Gauss-Markov process (sigma s, time constant T), built from native factors. Its path measure,
-exp(-int x'^2/2q - int x^2/2p) with q = 2 s^2/T, p = 2 s^2 T, and x^2/4s^2 at both ends, is a random walk with a prior
-about 0 at each node. That is exact as the node period goes to 0, and leaves the steps free for a robust loss (a
-`JacobianFactor` that contains the decay takes none); the priors, too: components that may stay far off (`SlowProcess.far`)
-have tails, w = 1 / (1 + x^2 / (F s)^2), on all of their part of the measure, so that of two levels one is the usual one. Once it
-is known which, only the nodes at that level have a prior (`at_level`).
+A slow error is a first-order Gauss-Markov process (sigma s, time constant T), built from native factors. The density of its path,
+exp(-int x'^2/2q - int x^2/2p) with q = 2 s^2/T, p = 2 s^2 T, and x^2/4s^2 at both ends, is that of a random walk with a prior
+about 0 at each node. That is exact as the node period goes to 0, and a robust loss may then be put on the steps (a `JacobianFactor`
+that contains the decay takes none) and on the priors. Axes that may stay far off (`SlowProcess.far`) have priors with tails,
+w = 1 / (1 + x^2 / (F s)^2), so that of two levels between which the error jumps one is the usual one, near 0. Once it is known
+which nodes are at the usual level, only these have a prior (`at_level`).
 """
 
 from __future__ import annotations
@@ -23,21 +23,23 @@ from numpy.typing import NDArray
 from graphloc import keys
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
-from graphloc.graph import CONSTANT_TAILS, InertialLink, SlowProcess
+from graphloc.graph import CONSTANT_TAILS, SlowProcess
+from graphloc.inertial import InertialLink
 from graphloc.time import NS_PER_S, duration_ns
 
 # Loss of a step: beyond this many sigmas it counts as a jump.
 JUMP = KernelConfig(kind="cauchy", scale=2.0)
-_FAR = 2.0  # F above: sigmas beyond which such a component counts as far off
-# Sigmas of the part of a constant's prior that is never weighed otherwise, and half of them the most that it is widened to: a vessel of
-# 100 m has its antenna 20 m from where 1 m was drafted.
+_FAR = 2.0  # F in the prior of an axis that may stay far off: sigmas beyond which it counts as far off
+# Times the sigma of a constant's prior: the sigma of its part whose weight never changes, and twice the widest that the whole is made
+# by re-weighting. A vessel of 100 m has its antenna 20 m from where 1 m (1 sigma) was drafted.
 _WIDEST = 60.0
 _NOTHING = 1e6  # sigmas: no information
 _NO_DRIFT = 100.0  # times the time constant
 _SILENT = 3.0  # times the usual time between measurements
 _SPACED_OVER_S = 4.0  # longer than gateways hold messages back
 SPACED_BY = 40
-"""Measurements up to one, at most, from which it is taken how far apart they come: of the fastest that are used two seconds."""
+"""Most measurements before one that tell how far apart they come (`spacing_s`): two seconds of the fastest that are used."""
+_IN_BOUNDS = 1.5  # sigmas of a slow error that the bounds include: jumps up to there need no word
 _CHAIN_END = 2.0  # variances of the process: the prior at either end of a chain
 
 
@@ -53,8 +55,8 @@ def slow_begin(
     """Yield the priors of the first node of a chain.
 
     Args:
-        known: (k,) its estimate, which sets the tails of constant components; None: only the part of their prior that is never weighed
-            otherwise (see `revisable`); `slow_end` has the other. jumps, far: as in `slow_step`.
+        known: (k,) estimate of that node, by which the priors of constants are re-weighted; None: of these priors only the part whose
+            weight never changes (`never_revised`), and `slow_end` yields the other. jumps, far: as in `slow_step`.
     """
     constant = slow.constant
     if constant.any():
@@ -68,24 +70,26 @@ def _with_no_tails(slow: SlowProcess) -> NDArray[np.bool_]:
 
 
 def _tails(slow: SlowProcess, value: Array) -> Array:
-    """Return by how much (k,) the priors of constants are widened at a value (k,); why: see `Constant.widened`."""
+    """Return the factors (k,) on the sigmas of constants, re-weighted at a value (k,); why: see `Constant.widened`."""
     return np.where(_with_no_tails(slow), 1.0, np.sqrt(1.0 + (value / slow.sigma) ** 2 / CONSTANT_TAILS))
 
 
 def revisable(sigma: Array, widened: Array) -> Array:
-    """Return the sigmas (k,) of the part of a constant's prior that a window may yet weigh otherwise; with the other part it is `widened`.
+    """Return the sigmas (k,) of the part of a constant's prior whose weight may still change.
 
-    Online a prior that has become part of what was marginalised, or of an anchor, keeps the weight that it had then: an antenna 20 m from its
-    mount (1 m, 1 sigma) was held back for good by what it was taken for in the first seconds, as if to 1 m.
+    The prior is two factors: a wide one (`never_revised`), and this one, re-weighted at the estimate; together they are as wide as
+    `widened`. Online a prior that was marginalised, or became part of an anchor, keeps the weight that it had then. As a single factor
+    it held an antenna that was 20 m from its mount (1 m, 1 sigma) back for good, by the weight of the first seconds, when the estimate
+    was still near the mount.
 
     Args:
-        sigma: (k,) of the prior. widened: (k,) the same re-weighted at the estimate.
+        sigma: (k,) of the prior. widened: (k,) of the prior re-weighted at the estimate.
     """
     return np.asarray((np.minimum(widened, 0.5 * _WIDEST * sigma) ** -2 - never_revised(sigma) ** -2) ** -0.5)
 
 
 def never_revised(sigma: Array) -> Array:
-    """Return the sigmas (k,) of the other part."""
+    """Return the sigmas (k,) of the part of a constant's prior whose weight never changes; the other part: `revisable`."""
     return _WIDEST * sigma
 
 
@@ -104,10 +108,12 @@ def slow_step(
     """Yield the factors of the step to the next node, `dt_s` later.
 
     Args:
-        jumps: whether steps have a robust loss. far: whether components that may stay far off have a prior; else see `at_level`.
-        jump_m: size of a position jump seen in this step: it, or the vessel, has moved so far.
-        expected: (k,) the step, where it is known besides.
-        anew: whether one chain ends here and another begins: all but constants is drawn anew (`SlowProcess.anew_after_s`).
+        jumps: whether steps that may be jumps have a robust loss. far: whether axes that may stay far off have a prior here; if not,
+            `at_level` yields it.
+        jump_m: size of a position jump seen in this step: the error, or the vessel, has moved so far. 0: none.
+        expected: (k,) mean of the step, where a jump was measured; None: 0.
+        anew: whether the error is drawn anew: all axes but constants are then independent of what they were
+            (`SlowProcess.anew_after_s`), so that one chain ends here and another begins.
     """
     constant = slow.constant
     # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
@@ -133,7 +139,11 @@ def without_drift(slow: SlowProcess) -> SlowProcess:
 
 
 def silent_s(slow: SlowProcess, apart_s: float) -> float:
-    """Return after how long without a measurement a slow error is drawn anew, of a sensor whose measurements are usually so far apart, s."""
+    """Return the silence, s, after which a sensor's slow error is drawn anew.
+
+    Args:
+        apart_s: usual time between the sensor's measurements, s.
+    """
     return max(slow.anew_after_s, _SILENT * apart_s)
 
 
@@ -143,7 +153,8 @@ def slow_end(
     """Yield the priors that close a chain at its last node.
 
     Args:
-        value: (k,) that node, where the prior of constants is here (see `slow_begin`). jumps, far: as in `slow_step`.
+        value: (k,) estimate of that node, if the chain began without one (see `slow_begin`): the part of the constants' priors whose
+            weight may change is then yielded here. jumps, far: as in `slow_step`.
     """
     yield from _standing(slow, key, np.full(len(slow.sigma), _CHAIN_END), jumps=jumps, far=far)
     if value is not None and (slow.constant & ~_with_no_tails(slow)).any():
@@ -158,12 +169,14 @@ def at_level(
     usual: NDArray[np.bool_],
     anew: NDArray[np.bool_] | None = None,
 ) -> Iterator[Any]:
-    """Yield the priors of a chain's components that may stay far off, where it is known which nodes are at the usual level.
+    """Yield the priors of a chain's axes that may stay far off, where it is known which nodes are at the usual level.
 
-    These have a Gaussian one, whose chain ends at the first and last of them; the others none, as a jump may lead anywhere.
+    Nodes at the usual level have a Gaussian prior, as of a chain that begins at the first and ends at the last of them. The others
+    have none, because a jump may lead anywhere.
 
     Args:
-        names: (N,) the keys of the nodes. dt_s: (N - 1,) between them. usual: (N,). anew: (N - 1,) steps at which it is drawn anew.
+        names: (N,) keys of the nodes. dt_s: (N - 1,) times between them. usual: (N,) which are at the usual level.
+        anew: (N - 1,) steps at which the error is drawn anew; None: none.
     """
     held = _usual_information(slow, dt_s, usual, anew)
     for n in np.flatnonzero(usual):
@@ -171,9 +184,9 @@ def at_level(
 
 
 def spacing_s(stamps_ns: NDArray[np.int64]) -> Array:
-    """Return how far apart measurements come (M,), s, each by the mean of the last seconds before it; inf for one alone.
+    """Return the mean time (M,), s, between measurements in the seconds before each; inf for one with none before it.
 
-    Not by the one before alone, nor by the median: a gateway may send five fixes within 10 ms, twice a second.
+    The time since the one before, or the median, would not do: a gateway may send five fixes within 10 ms, twice a second.
 
     Args:
         stamps_ns: (M,) in order.
@@ -215,10 +228,10 @@ def closing_variance(slow: SlowProcess, value: Array) -> Array:
 
 
 def standing_cost(slow: SlowProcess, path: Array, dt_s: Array, anew: NDArray[np.bool_] | None = None) -> float:
-    """Return the cost (nats) of the priors of a whole chain, of the components that may stay far off.
+    """Return the cost (nats) of a whole chain's priors, of the axes that may stay far off.
 
     Args:
-        path: (N, k) nodes. dt_s: (N - 1,) between them. anew: (N - 1,) steps at which it is drawn anew.
+        path: (N, k) estimates of the nodes. dt_s: (N - 1,) times between them. anew: (N - 1,) steps at which the error is drawn anew.
     """
     far = slow.far_axes
     square = ((path[:, far] / slow.sigma[far]) ** 2).sum(axis=1)
@@ -229,7 +242,7 @@ def standing_cost(slow: SlowProcess, path: Array, dt_s: Array, anew: NDArray[np.
 def _usual_information(
     slow: SlowProcess, dt_s: Array, usual: NDArray[np.bool_], anew: NDArray[np.bool_] | None
 ) -> Array:
-    """Return the information (N,) of the priors about 0 of a chain, each part of which ends at the first and last of its `usual` nodes."""
+    """Return the information (N,), in 1 / sigma^2, of a chain's priors about 0; each part between `anew` begins and ends at a `usual` node."""
     steps = dt_s / (2.0 * float(slow.time_constant_s[slow.far_axes].max()))
     begins = np.flatnonzero(np.zeros(len(dt_s)) if anew is None else anew) + 1
     held = np.concatenate([[0.0], steps])
@@ -243,10 +256,10 @@ def _usual_information(
 
 
 def _standing(slow: SlowProcess, key: int, times: Array, *, jumps: bool, far: bool) -> Iterator[Any]:
-    """Yield the priors about 0 of a node, with `times` (k,) the variance of the process; constants have none.
+    """Yield the priors about 0 of a node; their variances are `times` (k,) those of the process. Constants have none here.
 
-    Components that may stay far off have a prior of their own, or none (`far`): a height above another zero must not loosen the
-    horizontal ones.
+    Axes that may stay far off have a prior of their own, or none (`far`). In one prior with the others, a height above another zero
+    would loosen the horizontal axes.
     """
     held, tailed = ~slow.constant & (far | ~slow.far_axes), slow.far_axes & jumps
     for part in (held & ~tailed, held & tailed):
@@ -263,3 +276,12 @@ def _prior(key: int, sigmas: Array, tails: float | None = None) -> Any:
 
 def _with_tails(model: Any, scale: float) -> Any:
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(scale), model)
+
+
+def allowed_jump_m(slow: SlowProcess | None) -> float:
+    """Return the size (m) up to which the bounds include a jump.
+
+    Args:
+        slow: the slow error (east, north, ...) of a receiver, estimated or added to the bounds; None: it has none.
+    """
+    return 0.0 if slow is None else float(_IN_BOUNDS * slow.sigma[:2].max())

@@ -57,11 +57,14 @@ class Level:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartPrior:
-    """Gaussian prior on the first state of a stretch (covariances; block-diagonal, but for `level`).
+    """Gaussian prior on the first state of a stretch: pose, velocity and bias, independent of each other but for `level`.
 
     Attributes:
-        level: levelling of roll and pitch (then their part of `pose_cov` is wide); None: no such factor.
-        slow: value (k,) and covariance (k, k), by sensor number; others have the prior of their process.
+        pose: gtsam.Pose3, body in world. pose_cov: (6, 6), body tangent, rotation first.
+        velocity: (3,) m/s, world axes. velocity_cov: (3, 3).
+        bias: gtsam.imuBias.ConstantBias. bias_cov: (6, 6), accelerometer first.
+        level: levelling of roll and pitch, which ties them to the bias (their part of `pose_cov` is wide then); None: no such factor.
+        slow: value (k,) and covariance (k, k) of slow states, by sensor number. Those that it lacks have the prior of their process.
     """
 
     pose: Any

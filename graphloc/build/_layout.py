@@ -13,17 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.build._attach import Carry, asks_for_delay, state_of
-from graphloc.build._chains import silent_s, spacing_s, without_drift
+from graphloc.build._chains import allowed_jump_m, silent_s, spacing_s, without_drift
 from graphloc.build._problem import PositionJumps, Problem, Stream, inertial_factors, preintegrate
 from graphloc.build._usable import silent_sensors, sorted_out, usable_imu
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
-from graphloc.graph import PLACE, Constant, InertialLink, InertialRow, Sensor, SlowProcess
+from graphloc.graph import PLACE, Constant, Sensor, SlowProcess
+from graphloc.inertial import InertialLink, InertialRow
 from graphloc.measurements import Measurement
 from graphloc.recording import Mounts, Recording
 from graphloc.signals.pauses import common_pauses, pauses_warning
-from graphloc.signals.position_jumps import allowed_jump_m, position_jumps
+from graphloc.signals.position_jumps import position_jumps
 from graphloc.time import NS_PER_S, stamps_of, utc_text
 from graphloc.timeline import Timeline, make_timeline
 

@@ -20,14 +20,15 @@ from graphloc.build._attach import Carry, asks_for_delay, nav_state
 from graphloc.build._usual_motion import UsualMotion, usual_motion
 from graphloc.config import SensorConfig, VesselConfig
 from graphloc.frames import Array, Datum
-from graphloc.graph import Constant, Going, InertialLink, Sensor, SlowProcess
+from graphloc.graph import Constant, Sensor, SlowProcess
+from graphloc.inertial import GapMotion, InertialLink
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.time import NS_PER_S, stamps_of
 from graphloc.timeline import Timeline
 
 PositionJumps = tuple[NDArray[np.int64], Array]
-"""Stamps (K,), ns, and sizes (K,), m."""
+"""Stamps (K,), ns, and sizes (K,), m, of the position jumps of a receiver."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,16 +36,16 @@ class Stream:
     """The measurements of one sensor and where they attach.
 
     Attributes:
-        number: of the sensor, for keys. name, row, config: the sensor.
-        slow: its slow state, or None. left_out: the slow state that it would have beside a second position sensor.
-        without_height: the heights of its fixes are not used (`height_told_better`).
-        position_jumps: where it alone measures position.
-        constants: that its measurements may share.
-        mount: pose of the sensor from the IMU, body axes.
+        number: of the sensor, for keys. name, row, config: name, row of the table and configuration of the sensor.
+        slow: its slow state, or None. left_out: the slow state that it would have beside a second position sensor, or None.
+        without_height: whether the heights of its fixes are not used (`height_told_better`).
+        position_jumps: those of a receiver that alone measures position.
+        constants: those that its measurements depend on.
+        mount: pose of the sensor seen from the IMU, body axes (gtsam.Pose3).
         measurements: M of them by stamp. state: (M,) the state of each (`state_of`). carry: for each, the preintegrated motion
             from the state before it; None where its stamp is that of a state.
         gyro_radps: (M, 3) raw rate at each measurement, body axes. felt: (M, 6) raw specific force and change of the rate about it; 0 where no delay is asked for.
-        apart_s: (M,) how far apart they come (`spacing_s`).
+        apart_s: (M,) usual time between measurements, s, at each (`spacing_s`).
         shares: number of the sensor that has the same constants (`shared_constants`); None: they are its own.
         anew: after which slow nodes (K,) its slow error is drawn anew.
         usual: at which slow nodes (N,) its error is at its usual level; None: not known (see `solve/_levels.py`).
@@ -96,12 +97,17 @@ class Problem:
     """A run, ready to be solved.
 
     Attributes:
+        config: of the vessel. datum: origin of world. timeline: stamps of the states and slow nodes.
+        imu: samples of the IMU.
         t_body_imu_m, R_body_imu: (3,), (3, 3) mount of the IMU in body. imu_turn_rad: (3,) by which it is turned against the configured
-            one, body axes.
-        relink: makes the inertial links for a configuration of the IMU, a noise scale and a mount (3, 3). links: those of `noise_scale`.
-        preintegrated, inertial: motion from each state to the next, and its factor; neither depends on the estimate, so all graphs
+            mount, body axes.
+        relink: returns the links of the IMU for its configuration, a noise scale and the rotation (3, 3) of its mount.
+        links: preintegration of the IMU, with its noise scaled by `noise_scale`.
+        preintegrated, inertial: motion from each state to the next, and its factor. Neither depends on the estimate, so all graphs
             share them.
+        streams: measurements of each sensor, and where they attach.
         rejected: ledger rows of measurements that the graph cannot take.
+        warnings: one line each, for the report.
         silent: clauses on why sensors have no measurement here.
         left_out: spans (after one stamp until another, ns) whose samples of the IMU are left out.
         usual_motion: where the motion model is used; None before there is an estimate, and where nothing needs it.
@@ -246,7 +252,7 @@ def _bridged(problem: Problem, values: gtsam.Values, gaps: Sequence[tuple[int, i
     for start_ns, stop_ns in gaps:
         first = timeline.floor(start_ns)
         bias = values.atConstantBias(keys.bias(int(timeline.slow_of[first])))
-        going = Going.of(nav_state(values, first), bias)
+        going = GapMotion.of(nav_state(values, first), bias)
         for k in range(first, min(timeline.floor(stop_ns - 1) + 1, len(timeline) - 1)):
             a, b = (int(stamp) for stamp in timeline.stamps_ns[k : k + 2])
             preintegrated[k] = problem.links.integrate(a, b, zero, going)

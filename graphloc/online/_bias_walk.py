@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtr, chdtri
 
-from graphloc.graph import InertialLink
+from graphloc.inertial import InertialLink
 from graphloc.measurements import ImuSeries
 from graphloc.online._lag import Lag
-from graphloc.solve.bias_walk import KEYS, MOST_TIMES, KnownBias, too_steady, went_too_far
+from graphloc.solve.bias_walk import MOST_TIMES, WALK_KEYS, KnownBias, too_steady, went_too_far
 
 _EVERY_S = 10.0
 _RAISED_BY = 6  # of these: a minute; a bias that creeps shows after the longest
@@ -46,7 +46,7 @@ class BiasWalk:
 
     def of(self, sensor: Any) -> Any:
         """Return the configuration of the IMU with its walk raised."""
-        return sensor.scaled(dict(zip(KEYS, self.times.tolist(), strict=True)))
+        return sensor.scaled(dict(zip(WALK_KEYS, self.times.tolist(), strict=True)))
 
     def changed(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
         """Raise the walk of accelerometers or gyroscopes where that is needed, lower it where it is no more; return a line on that, or empty."""
@@ -87,7 +87,7 @@ class BiasWalk:
             self.times[k] = max(self.times[k] * less, 1.0)
             name = samples().sensor
             imu = lag.problem.config.sensors[name]
-            return f"{name}: its biases change less than before: {KEYS[k]} is {getattr(imu, KEYS[k]):.3g}, {getattr(self.of(imu), KEYS[k]):.3g} is taken"
+            return f"{name}: its biases change less than before: {WALK_KEYS[k]} is {getattr(imu, WALK_KEYS[k]):.3g}, {getattr(self.of(imu), WALK_KEYS[k]):.3g} is taken"
         return ""
 
 

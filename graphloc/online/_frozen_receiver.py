@@ -13,6 +13,7 @@ from collections import deque
 import numpy as np
 
 from graphloc.frames import Array
+from graphloc.signals.series import line_fit
 
 WINDOW_S, _FEWEST = 4.0, 4  # seconds and fixes that a decision is made from
 _LEAST_MPS = 0.7  # no multipath drifts so fast
@@ -64,18 +65,17 @@ class FrozenReceiverDetector:
         if len(t) < _FEWEST or t[-1] - t[0] < WINDOW_S:
             return
         told, off = (np.array([row[k] for row in self._seen]) for k in (1, 2))
-        growth, steady = _slope(t, off)
-        left = off - off.mean(axis=0) - np.outer(t - t.mean(), growth)
-        rms, speed = float(np.sqrt((left**2).sum(axis=1).mean())), float(np.linalg.norm(growth))
+        growth = line_fit(t, off)
+        rms, speed = float(np.sqrt((growth.left**2).sum(axis=1).mean())), float(np.linalg.norm(growth.slope))
         late = t > t[-1] - (0.5 if self.frozen else 1.0) * WINDOW_S  # shorter when frozen, so that motion is seen soon
         of_vessel_mps = _SHARE * float(np.linalg.norm(v_mps))
         least = max(_LEAST_MPS, of_vessel_mps)
         if self.frozen:  # the growing uncertainty of the velocity without it is no evidence that it moves
-            moves_mps, noise_m, noise_mps = _motion(t[late], told[late], sigma_m)
+            moves_mps, _, noise_mps = _motion(t[late], told[late], sigma_m)
             stands = moves_mps < _STANDS_MPS + _SIGMAS * noise_mps
             self.frozen = stands and speed > 0.5 * least and not self._has_left(told[late])
             return
-        least = max(least, _SIGMAS * float(np.hypot(max(sigma_m, rms) * steady, sigma_mps)))
+        least = max(least, _SIGMAS * float(np.hypot(max(sigma_m, rms) * growth.sigma, sigma_mps)))
         if self._along_s is None and speed < 0.5 * least:
             self._along_s = at_s
         along = self._along_s is not None and at_s - self._along_s > _ALONG_S
@@ -108,21 +108,14 @@ class FrozenReceiverDetector:
 
 def _motion(t: Array, places_m: Array, sigma_m: float) -> tuple[float, float, float]:
     """Speed of places (N, 2), m, at times (N,), s; the noise of a place (m), of which `sigma_m` is claimed; and that of the speed."""
-    v_mps, noise = _slope(t, places_m)
-    # Many claim far more than they scatter by: by that any boat would seem to stand.
-    noise_m = min(sigma_m, _scatter(t, places_m, v_mps))
-    return float(np.linalg.norm(v_mps)), noise_m, noise_m * noise
+    line = line_fit(t, places_m)
+    noise_m = min(
+        sigma_m, _scatter(line.left)
+    )  # many claim far more than they scatter by: by that any boat would seem to stand
+    return float(np.linalg.norm(line.slope)), noise_m, noise_m * line.sigma
 
 
-def _scatter(t: Array, places_m: Array, v_mps: Array) -> float:
-    """Noise of places (N, 2), m, at times (N,), s, about a line of velocity (2,), m/s, 1 sigma of an axis; inf where too few tell it."""
-    left = places_m - places_m.mean(axis=0) - np.outer(t - t.mean(), v_mps)
-    freedom = 2 * len(t) - 4
-    return float(np.sqrt((left**2).sum() / freedom)) if freedom >= _FREEDOM else np.inf
-
-
-def _slope(t: Array, places_m: Array) -> tuple[Array, float]:
-    """Velocity (2,) of places (N, 2), m, at times t (N,), s, and its sigma per metre of their noise."""
-    dt = t - t.mean()
-    square = max(float(dt @ dt), 1e-9)
-    return dt @ (places_m - places_m.mean(axis=0)) / square, 1.0 / float(np.sqrt(square))
+def _scatter(left_m: Array) -> float:
+    """Noise of places by their residuals (N, 2), m, about a straight line, 1 sigma of an axis; inf where too few tell it."""
+    freedom = 2 * len(left_m) - 4
+    return float(np.sqrt((left_m**2).sum() / freedom)) if freedom >= _FREEDOM else np.inf

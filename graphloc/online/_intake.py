@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from graphloc.measurements import ImuSample, ImuSeries
-from graphloc.signals.frozen_imu import WHY, FrozenImuDetector
-from graphloc.signals.imu_spikes import WHY as SPIKE
-from graphloc.signals.imu_spikes import SpikeDetector
+from graphloc.signals.frozen_imu import FROZEN_IMU, FrozenImuDetector
+from graphloc.signals.imu_spikes import IMU_SPIKE, SpikeDetector
 from graphloc.time import stamps_of
 
 _BACK = 50  # samples in a row with stamps before the newest: the clock was set back
@@ -102,7 +101,7 @@ class ImuIntake:
             accepted += right
             spiked += wrong
         already, self._spiked = self._spiked, self._spiked or bool(spiked)
-        dropped = (*taken.dropped, *((held, _LOST) for held in lost), *((held, SPIKE) for held in spiked))
+        dropped = (*taken.dropped, *((held, _LOST) for held in lost), *((held, IMU_SPIKE) for held in spiked))
         return taken._replace(accepted=tuple(accepted), dropped=dropped, newly_spiked=self._spiked and not already)
 
     def left(self) -> list[ImuSample]:
@@ -116,7 +115,7 @@ class ImuIntake:
             return Taken(dropped=((m, absurd),), absurd=absurd)
         already = self._frozen.frozen
         if self._frozen.repeats(m):
-            return Taken(dropped=((m, WHY),), absurd=WHY, newly_frozen=not already)
+            return Taken(dropped=((m, FROZEN_IMU),), absurd=FROZEN_IMU, newly_frozen=not already)
         newest, jumped = self.newest, self.jumped
         if newest is None:
             return Taken(accepted=(m,))

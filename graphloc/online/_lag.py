@@ -293,11 +293,10 @@ class Lag:
     def _settled_ns(self, name: str) -> int:
         """Return when last another sensor of position agreed: of those that read the same receiver by turns, one of smaller slow error (RTK); 0: none has."""
         own, streams = self.problem.streams[name], self.problem.streams
-        same = self.problem.config.by_turns(name)[1:]
-        beside = [streams[other] for other in same if other in streams]
-        better = [s.name for s in beside if s.slow and own.slow and s.slow.sigma[0] < own.slow.sigma[0]]
-        others = [s.name for s in streams.values() if s.row.absolute and s.name not in (name, *same)]
-        return max((self._agreement.agreed_ns.get(other, 0) for other in (*better, *others)), default=0)
+        beside = [streams[other] for other in self.problem.config.by_turns(name)[1:] if other in streams]
+        better = [s for s in beside if s.slow and own.slow and s.slow.sigma[0] < own.slow.sigma[0]]
+        settling = (*better, *self.problem.others_of_place(name))
+        return max((self._agreement.agreed_ns.get(s.name, 0) for s in settling), default=0)
 
     @property
     def denied(self) -> Mapping[str, int]:

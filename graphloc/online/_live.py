@@ -31,7 +31,8 @@ from graphloc.build import (
 )
 from graphloc.config import SensorConfig, TimelineConfig, VesselConfig
 from graphloc.frames import Array, Datum
-from graphloc.graph import Constant, InertialLink, Sensor, SlowProcess
+from graphloc.graph import Constant, Sensor, SlowProcess
+from graphloc.inertial import InertialLink
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.motion_model import MotionModel
 from graphloc.online._frozen_receiver import FrozenReceiverDetector
@@ -175,12 +176,17 @@ class LiveStream:
     """The measurements of one sensor in order of arrival (offline: `graphloc.build.Stream`), and its detectors.
 
     Attributes:
+        number, name, row, config, constants, mount, shares, without_height: as of a `build.Stream`.
         slow: the slow error that is estimated. left_out: the one that is added to the bounds instead, because no second sensor
             separates it from motion; both, once the receiver has jumped: then the window estimates its jumps.
-        by_stamp: stamps (ns) and indices of the measurements that are kept, in order.
-        jumps: those that the window estimates.
-        told_ns: the newest stamp of its measurements. anew_ns: that of the newest before its slow error was last drawn anew.
-        shares, without_height: as of a `build.Stream`.
+        measurements, state, carry, gyro_radps, felt, apart_s: as of a `build.Stream`, by order of arrival; the window forgets the first.
+        by_stamp: stamps (ns) and indices of the measurements that are kept, by stamp.
+        scatter: by what factor its residuals scatter more than stated.
+        frozen_detector: whether its position stays while the estimate moves; a restart forgets it.
+        receiver: detectors that outlive the window.
+        jumps: position jumps that the window estimates.
+        told_ns: the newest stamp of its measurements. anew_ns: that of the newest before its slow error was last drawn anew; None: it
+            never was.
     """
 
     number: int
@@ -268,7 +274,12 @@ class LiveStream:
 
 @dataclass(slots=True, eq=False)
 class LiveProblem:
-    """What `attach` needs, and the IMU. `t_body_imu_m` (3,), `R_body_imu` (3, 3): mount of the IMU in body, and how far it may be off."""
+    """A problem that grows and forgets; what `build.attach` needs of it is as of a `build.Problem`.
+
+    Attributes:
+        t_body_imu_m, R_body_imu: (3,), (3, 3) mount of the IMU in body. imu_mount_sigma_rad: by how much it may be turned, each axis.
+        links: preintegration of the IMU. streams: by name of the sensor.
+    """
 
     config: VesselConfig
     datum: Datum
@@ -279,6 +290,11 @@ class LiveProblem:
     links: InertialLink
     streams: dict[str, LiveStream]
     motion_model: MotionModel
+
+    def others_of_place(self, name: str) -> list[LiveStream]:
+        """Return the other sensors of position, without those that read the same receiver by turns."""
+        same = self.config.by_turns(name)
+        return [s for s in self.streams.values() if s.row.absolute and s.name not in (name, *same)]
 
     def take(self, m: Measurement) -> tuple[LiveStream, int]:
         """Attach a measurement to its state; return its stream and its index there."""

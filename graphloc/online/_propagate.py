@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from graphloc.frames import Array
-from graphloc.graph import Going
+from graphloc.inertial import GapMotion
 from graphloc.online._live import LiveProblem
 from graphloc.online._odometry import Odometry
 from graphloc.online._states import Newest, propagated_covariance
@@ -51,7 +51,7 @@ def propagate(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns
     """Return the newest state propagated to a later stamp, which may lie after the last IMU sample."""
     pose = newest.pose
     start = gtsam.NavState(pose, newest.velocity)
-    pim = problem.links.integrate(newest.stamp_ns, stamp_ns, newest.bias, Going.of(start, newest.bias))
+    pim = problem.links.integrate(newest.stamp_ns, stamp_ns, newest.bias, GapMotion.of(start, newest.bias))
     there = pim.predict(start, newest.bias)
     p_odom, R_odom = odometry.after(*_body_step(problem, pose, there.pose()))
     dt_s, noise = (stamp_ns - newest.stamp_ns) * 1e-9, pim.preintMeasCov()
@@ -74,9 +74,9 @@ def advance_odometry(odometry: Odometry, problem: LiveProblem, newest: Newest, u
         return
     start = gtsam.NavState(newest.pose, newest.velocity)
     if before_ns < odometry.stamp_ns:
-        start = links.integrate(before_ns, odometry.stamp_ns, bias, Going.of(start, bias)).predict(start, bias)
+        start = links.integrate(before_ns, odometry.stamp_ns, bias, GapMotion.of(start, bias)).predict(start, bias)
         before_ns = odometry.stamp_ns
-    pim = links.integrate(before_ns, until_ns, bias, Going.of(start, bias))
+    pim = links.integrate(before_ns, until_ns, bias, GapMotion.of(start, bias))
     there = pim.predict(start, bias)
     dp, dR = _body_step(problem, start.pose(), there.pose())
     R, noise = start.attitude().matrix(), np.asarray(pim.preintMeasCov())[:6, :6]

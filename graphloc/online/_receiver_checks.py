@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from graphloc import gauss
+from graphloc.build import allowed_jump_m
 from graphloc.frames import Array
 from graphloc.graph import TIME_OFFSET, Attachment, Residual, antenna_off_m, corrections
 from graphloc.measurements import Measurement
@@ -17,18 +18,17 @@ from graphloc.online._entries import Entries
 from graphloc.online._frozen_receiver import WINDOW_S
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import States
-from graphloc.signals.frozen_receiver import FROZEN, WHY_VELOCITY
+from graphloc.signals.frozen_receiver import FROZEN, FROZEN_VELOCITY
 from graphloc.signals.position_jumps import (
     OffPrediction,
-    allowed_jump_m,
     jump_warnings,
     largest_sigma,
     only_position_sensor,
 )
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, duration_ns
 
 _FITS = 3.0  # sigmas of a fix alone
-_FROZEN = f"{FROZEN}: it repeats one position while the vessel moves"
+FROZEN_ONLINE = f"{FROZEN}: it repeats one position while the vessel moves"
 _OLD = "it repeats the fix before it while the vessel moves"
 _OFF = "off what the IMU predicts: an outlier, or a position jump too short to tell"
 
@@ -56,16 +56,16 @@ class ReceiverChecks:
         if np.isfinite(hint.v_world_mps).all():
             repeated = stream.receiver.repeated_velocity
             repeated.note(m.stamp_ns, hint.v_world_mps)
-            return WHY_VELOCITY if repeated.is_old(m.stamp_ns, hint.v_world_mps) else ""
+            return FROZEN_VELOCITY if repeated.is_old(m.stamp_ns, hint.v_world_mps) else ""
         told_m = hint.p_world_m[:2]
         if not stream.row.absolute or not np.isfinite(told_m).all():
             return ""
         estimated_m, v_mps = _antenna(stream, at)
         if self._repeats(stream, m, at, told_m, v_mps):
-            return _FROZEN if stream.receiver.repeated_fix.frozen else _OLD
+            return FROZEN_ONLINE if stream.receiver.repeated_fix.frozen else _OLD
         sigma_m = largest_sigma(residual.white_cov)
         if self._is_frozen(stream, m, told_m, estimated_m, sigma_m):
-            return _FROZEN
+            return FROZEN_ONLINE
         if not self._is_alone(stream):
             stream.receiver.jump.let_go()
             return ""
@@ -80,7 +80,9 @@ class ReceiverChecks:
         since_ns = detector.note(m.stamp_ns, told_m, v_mps, largest_sigma(newest.velocity_cov))
         if since_ns is not None:
             self._reject_since(stream, since_ns, m.stamp_ns)
-            self._warnings.append(f"{stream.name}: {_FROZEN}: for {(m.stamp_ns - since_ns) / NS_PER_S:.1f} s until now")
+            self._warnings.append(
+                f"{stream.name}: {FROZEN_ONLINE}: for {(m.stamp_ns - since_ns) / NS_PER_S:.1f} s until now"
+            )
         return detector.is_old(m.stamp_ns, told_m)
 
     def _is_frozen(self, stream: LiveStream, m: Measurement, told_m: Array, estimated_m: Array, sigma_m: float) -> bool:
@@ -90,20 +92,15 @@ class ReceiverChecks:
         detector.note(at_s, told_m, estimated_m, sigma_m, newest.velocity[:2], largest_sigma(newest.velocity_cov))
         if detector.frozen and not before:
             since_s = min(at_s - WINDOW_S, detector.stands_s)
-            self._reject_since(stream, m.stamp_ns - int((at_s - since_s) * NS_PER_S), m.stamp_ns)
+            self._reject_since(stream, m.stamp_ns - duration_ns(at_s - since_s), m.stamp_ns)
         if detector.for_long(at_s):
             self._agreement.note(stream, m, None)
         return detector.frozen
 
     def _is_alone(self, stream: LiveStream) -> bool:
         """Return whether no other sensor holds the place: one that is silent, as cameras are until the berth is in sight, does not either."""
-        heard = [s for s in self._others(stream) if len(s.measurements) > s.measurements.first]
+        heard = [s for s in self._problem.others_of_place(stream.name) if len(s.measurements) > s.measurements.first]
         return only_position_sensor(stream, [stream, *heard])
-
-    def _others(self, stream: LiveStream) -> list[LiveStream]:
-        """Return the other sensors of position, without those that read the same receiver by turns."""
-        same = self._problem.config.by_turns(stream.name)
-        return [s for s in self._problem.streams.values() if s.row.absolute and s.name not in (stream.name, *same)]
 
     def _off(self, stream: LiveStream, at: Attachment, residual: Residual, off_m: Array) -> OffPrediction | None:
         """Return how the newest fix lies to its prediction; None where the receiver's slow error is switched off, or cannot jump.
@@ -113,7 +110,7 @@ class ReceiverChecks:
         Args:
             off_m: (2,) of the fix from the estimated place, slow error aside.
         """
-        slow = stream.left_out or (stream.slow if self._others(stream) else None)
+        slow = stream.left_out or (stream.slow if self._problem.others_of_place(stream.name) else None)
         if slow is None or not slow.jumps or stream.receiver.jump.jumps != stream.jumps:
             return None
         without = residual.raw
@@ -143,7 +140,7 @@ class ReceiverChecks:
         stream.receiver.jump.forget_since(since_ns)
         for entry in self._entries.of(stream):
             if since_ns <= entry.measurement.stamp_ns < until_ns:
-                self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0, reason=_FROZEN))
+                self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0, reason=FROZEN_ONLINE))
 
     def warnings(self) -> list[str]:
         """Return a line on each receiver whose position has jumped, or turned out to have been frozen, since this was last asked."""
@@ -162,5 +159,5 @@ def _antenna(stream: LiveStream, at: Attachment) -> tuple[Array, Array]:
     off_m = antenna_off_m(found)
     off_m = np.zeros(3) if off_m is None else off_m
     v_mps = at.sensor_velocity_mps(off_m)
-    place = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.transformFrom(off_m)))
+    place = at.sensor_m(off_m)
     return place[:2] + v_mps[:2] * found.get(TIME_OFFSET, 0.0), v_mps

@@ -12,6 +12,7 @@ from graphloc.measurements import Measurement
 from graphloc.online._lag import Lag
 from graphloc.solve.sensor_noise import Pair, pairs_of, times_stated
 from graphloc.solve.warnings import scale_warning
+from graphloc.time import duration_ns
 
 _EVERY_S = 5.0  # between two looks, to save time: a factor is that of a minute or more of pairs; a choice
 _SETTLED_S = 1.5  # after so long a measurement has been judged again
@@ -52,7 +53,7 @@ class SensorNoise:
         self._looked_ns = at_ns
         for name, stream in lag.problem.streams.items():
             last, times = self._last.get(name), self.times.get(name, {})
-            judged = lag.judged(name, last[0].stamp_ns if last else 0, at_ns - int(_SETTLED_S * 1e9))
+            judged = lag.judged(name, last[0].stamp_ns if last else 0, at_ns - duration_ns(_SETTLED_S))
             if not judged or not stream.row.scaled(judged[0][0]):
                 continue
             new = pairs_of(stream, [last, *judged] if last else judged)

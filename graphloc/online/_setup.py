@@ -11,7 +11,8 @@ from typing import Any
 from graphloc.build import mount_of, rows_of
 from graphloc.config import ImuConfig, VesselConfig
 from graphloc.frames import Datum, yaw_from_rotation
-from graphloc.graph import Hint, InertialRow, Sensor
+from graphloc.graph import Hint, Sensor
+from graphloc.inertial import InertialRow
 from graphloc.measurements import Measurement
 from graphloc.recording import Mounts
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feed measurements as they arrive, get estimates.
 
-There is an estimate (`_tracking`), or what arrives is held until one can be started (`_waiting`, `_start`). A window that
-fails is rebuilt from an earlier state; where that fails too, where the IMU was silent for too long, where its clock was
-set back or where no absolute sensor agrees any more, the estimate restarts.
+Either there is an estimate (`_tracking`), or all that arrives is held until one can be started (`_waiting`, `_start`). A window
+that fails is rebuilt from an earlier state. The estimate restarts where that fails too, where the IMU was silent for too long, where
+its clock was set back, and where no absolute sensor agrees any more.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from graphloc.config import VesselConfig
 from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate, Event
 from graphloc.frames import Array, Datum
-from graphloc.graph import InertialRow, Sensor
+from graphloc.graph import Sensor
+from graphloc.inertial import InertialRow
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement
 from graphloc.online._intake import ImuIntake, series_of
@@ -34,17 +35,17 @@ from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._waiting import Waiting
 from graphloc.origin import refuse_world_without_datum
 from graphloc.recording import Mounts
-from graphloc.signals.frozen_imu import WHY
-from graphloc.signals.imu_spikes import WHY as SPIKE
+from graphloc.signals.frozen_imu import FROZEN_IMU
+from graphloc.signals.imu_spikes import IMU_SPIKE
 from graphloc.signals.thinning import THINNED, Thinning
 from graphloc.solve.warnings import slow_error_warning
 from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
-_AGAIN_S = 6.0  # of data, with which a lost estimate starts anew
-_AHEAD_S = 60.0  # of the IMU: a stamp of another clock
-_MOST_NAMES = 100  # of sensors that are not configured: each is said once
+_AGAIN_S = 6.0  # length of the data with which a lost estimate starts anew
+_AHEAD_S = 60.0  # by which a stamp may lie ahead of the IMU's: beyond, it is of another clock
+_MOST_NAMES = 100  # unconfigured sensors of which it is said, once each, that they are ignored
 _NOT_REACHED = "the estimate restarted before IMU data reached its stamp"
 _NOT_ASKED = "its sensor is switched off or not in the configuration"
 
@@ -56,11 +57,11 @@ class OnlineSmoother:
         config: the vessel, its surveys read. rows, inertial: the table of sensors (`graphloc.factors`).
         datum: origin of world; None: from the configuration, or else from the first fixes.
         mounts: body -> sensor (t (3,), R (3, 3)) of sensors whose mount is not the configuration's (`tf_frame`, of /tf_static).
-        lag_s: how long measurements can still be re-judged, and how late they may come.
-        snapshot: file that is written every few seconds, and resumed from if it is there; None: no such file.
+        lag_s: how long a measurement can still be judged otherwise, and how late it may come.
+        snapshot: file to write the state to every few seconds, and to resume from if it is there; None: no such file.
 
     Raises:
-        InputError: something is given in world, and nothing says where its origin is; or a mount is that of a frame, and not in `mounts`.
+        InputError: a sensor measures in world, whose origin is not known; or a mount is given by a frame that is not in `mounts`.
     """
 
     def __init__(
@@ -94,10 +95,10 @@ class OnlineSmoother:
         self._say(trouble)
         self._waiting = Waiting(self._ledger)
         self._tracking: Tracking | None = None
-        # To start over with a heading that was a guess: the last try, and how often the data have denied what a check of the motion told.
+        # To start over where the heading was a guess: stamp of the last try, and how often the data denied a heading that the motion told.
         self._tried_ns, self._denied = 0, 0
         self.antennas_off_m: Mapping[str, Array] = {}
-        """How far from its mount each antenna is (3,), m, body axes, where that is estimated; known in the end (`finish`)."""
+        """By receiver, place of the antenna less that of its mount (3,), m, body axes, where it is estimated; set by `finish`."""
         self._wait(
             "the first IMU sample" if imu else f"an IMU: no enabled sensor of kind {inertial.kind} is configured"
         )
@@ -119,13 +120,13 @@ class OnlineSmoother:
 
     @property
     def factor_slots(self) -> int:
-        """Places that the solver keeps for factors: flat, however long it runs."""
+        """Number of places that the solver keeps for factors; it does not grow with the length of the run."""
         return 0 if self._tracking is None else self._tracking.lag.factor_slots
 
     def predict(self, stamp_ns: int | None = None) -> Estimate | None:
-        """Return the pose at a stamp (default: of the newest IMU sample) from the newest state.
+        """Return the newest state propagated by the IMU to a stamp; by default that of the newest IMU sample.
 
-        None before the start, and for a stamp farther ahead of the IMU than its silence is bridged.
+        None before the start, and for a stamp that lies farther ahead of the IMU than its silences are bridged (`max_bridge_s`).
         """
         newest = self._intake.newest
         if self._tracking is None or newest is None:
@@ -140,21 +141,21 @@ class OnlineSmoother:
         return self._estimate(at_ns)
 
     def window(self) -> Trajectory | None:
-        """Return the states of the lag as they are now estimated, up to the newest IMU sample: a prior for front-ends.
+        """Return the states of the lag as estimated now, and the newest one propagated to the newest IMU sample: a prior for front-ends.
 
-        The covariance at all of them is that of the newest, as scans are searched around it (see `Tracking.trajectory`).
+        All have the covariance of the newest, because scans are searched around that (see `Tracking.trajectory`).
         """
         now = self.predict()
         return None if now is None or self._tracking is None else self._tracking.trajectory(now)
 
     def rows(self) -> list[LedgerRow]:
-        """Return the rows of the ledger that became final since this was last asked; measurements leave with the lag."""
+        """Return the ledger rows that became final since the last call; that of a measurement does when it leaves the lag."""
         if self._tracking is not None:
             self._ledger.enter(self._tracking.lag.gone())
         return self._ledger.taken()
 
     def events(self) -> list[Event]:
-        """Return what happened since this was last asked: started, restarted, rebuilt, resumed, what is wrong with a sensor."""
+        """Return what happened since the last call: start, restart, rebuild, resume, and what is wrong with a sensor."""
         events, self._events = self._events, []
         return events
 
@@ -176,7 +177,7 @@ class OnlineSmoother:
     # What arrives
 
     def feed(self, m: Measurement) -> Estimate | None:
-        """Take a measurement (an `ImuSample` too); return the newest estimate if this made a new one."""
+        """Take a measurement or an `ImuSample`; return the new estimate, if it made one, else None."""
         if isinstance(m, ImuSample):
             return self._feed_imu(m)
         if m.sensor not in self._setup.measuring:
@@ -195,7 +196,7 @@ class OnlineSmoother:
         return None
 
     def _put_right(self, sensor: str, off_ns: int) -> None:
-        """Put right what is held of a sensor whose stamps were ahead by so much; an estimate that it has misled starts anew."""
+        """Correct the stamps of what is held of a sensor, which were ahead by `off_ns`; an estimate that used them starts anew."""
 
         def right(m: Measurement) -> Measurement:
             return replace(m, stamp_ns=m.stamp_ns - off_ns) if m.sensor == sensor else m
@@ -213,7 +214,7 @@ class OnlineSmoother:
                 self._take(right(m))
 
     def _take(self, m: Measurement) -> None:
-        """Keep a measurement, its stamp put right, until the states reach it."""
+        """Keep a measurement whose stamp is right until the states reach it, or give it its ledger row."""
         if self._thinnings[m.sensor].drops(m.stamp_ns):
             self._ledger.drop(m, Outcome.REJECTED, THINNED)
             return
@@ -251,9 +252,9 @@ class OnlineSmoother:
         if taken.absurd and self._tracking is None:
             self._waiting.why = f"IMU data that a vessel can have: {taken.absurd}"
         if taken.newly_frozen:
-            self._say(f"{m.sensor}: {WHY}; treated as an IMU gap until the samples change")
+            self._say(f"{m.sensor}: {FROZEN_IMU}; treated as an IMU gap until the samples change")
         if taken.newly_spiked:
-            self._say(f"{m.sensor}: a sample is {SPIKE}; all such are rejected")
+            self._say(f"{m.sensor}: a sample is {IMU_SPIKE}; all such are rejected")
         if taken.late is not None:
             self._keep_imu(taken.late, taken.hole)
         if taken.set_back_s:
@@ -282,7 +283,7 @@ class OnlineSmoother:
     # An estimate underway
 
     def _advance(self, tracking: Tracking, until_ns: int) -> Estimate | None:
-        """Make the states that are due, with all that belongs to them."""
+        """Make the states that are due up to a stamp, judge what attaches to them, and rebuild or restart where that asks for it."""
         if not tracking.due(until_ns):
             return None
         try:
@@ -380,10 +381,10 @@ class OnlineSmoother:
         until_ns: int,
         near_rad: float | None = None,
     ) -> Started | str:
-        """Return the start, or what it waits for; what lies ahead of `until_ns`, the newest sample's stamp, is left out.
+        """Return the start, or in words what it waits for.
 
         Args:
-            near_rad: as in `try_start`.
+            until_ns: stamp of the newest sample; later measurements are left out. near_rad: as in `try_start`.
         """
         reached = [m for m in others if m.stamp_ns <= until_ns]
         try:
@@ -393,7 +394,7 @@ class OnlineSmoother:
             return f"data from which the start can be solved: {in_one_line(error)}"
 
     def _take_over(self, started: Started, samples: list[ImuSample], others: list[Measurement], until_ns: int) -> None:
-        """Build the window where the start says, and bring it to now."""
+        """Build the window at the start's state, and bring it up to the newest sample."""
         persistent = self._persistent
         self._setup = self._setup.without_start_heading()
         persistent.datum, persistent.heights_m = started.datum, started.heights_m
@@ -432,13 +433,13 @@ class OnlineSmoother:
     def _start_with_heading(
         self, tracking: Tracking, now_ns: int, known: UnmeasuredHeading | None
     ) -> tuple[str, Started, list[Measurement]] | None:
-        """Return why, the start and from what, if sensors or the motion tell a heading by now that was a guess, and it is none.
+        """Return a new start where the heading was a guess, and sensors or the motion tell it by now: why, the start, and its data.
 
-        Corrected in the window, a wrong guess leaves wrong biases, velocities and places of antennas behind, and with them a wrong
-        heading.
+        None where the heading was no guess, or nothing tells it yet. If the window corrected a wrong guess instead, wrong biases,
+        velocities and places of antennas would stay, and with them a wrong heading.
 
         Args:
-            known: how far the heading could be off before the newest state.
+            known: by how much the heading could be off before the newest state; None: it was no guess.
         """
         if known is None or not known.doubt(now_ns):
             return None
@@ -468,7 +469,12 @@ class OnlineSmoother:
         started: Started | None = None,
         came: Sequence[Measurement] = (),
     ) -> Estimate | None:
-        """Start anew with what was measured since a stamp (ns); `started`: or from `came`, where that has been solved."""
+        """Start anew with the data since a stamp (ns), or with other data.
+
+        Args:
+            why: for the event. started: the start, where it is solved; it was solved from `came`.
+            came: data to start from instead, if any.
+        """
         again = tracking.end_but(since_ns)
         self._persistent.agreed_ns.update(tracking.lag.agreed_ns)
         self._say(f"{why}: restarts")
@@ -484,7 +490,7 @@ class OnlineSmoother:
         return self._begin(started, newest.stamp_ns)
 
     def _resume(self, newest: ImuSample) -> None:
-        """Go on from the snapshot, if the first sample is not too far from it."""
+        """Go on from the snapshot, if the first sample comes soon enough after it."""
         assert self._resumable is not None
         found, self._resumable, setup = self._resumable, None, self._setup
         age_s, bridge_s = (newest.stamp_ns - found.anchor.stamp_ns) * 1e-9, setup.bridge_s
@@ -517,7 +523,7 @@ class OnlineSmoother:
                 self._take(persistent.clocks[m.sensor].right(m))
 
     def finish(self) -> list[LedgerRow]:
-        """End: return the rows of all that is left."""
+        """End the run; return the ledger rows of all that has none yet."""
         for m in [m for clock in self._persistent.clocks.values() for m in clock.left()]:
             self._take(m)
         why = f"never started: waiting for {self._waiting.why}"

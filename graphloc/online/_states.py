@@ -14,7 +14,8 @@ from graphloc import keys
 from graphloc.build import bias_step, closing_variance, nav_state, slow_begin, slow_end, slow_step
 from graphloc.errors import SolveError
 from graphloc.frames import Array
-from graphloc.graph import TIME_OFFSET, Attachment, Going, InertialLink, Residual
+from graphloc.graph import TIME_OFFSET, Attachment, Residual
+from graphloc.inertial import GapMotion, InertialLink
 from graphloc.motion_model import UNSURE_MPS, Moving
 from graphloc.online._anchor import Anchor, in_world, without_priors
 from graphloc.online._constants import Constants
@@ -159,7 +160,7 @@ class States:
         following, t = timeline.slow_of[k + 1], timeline.page_s(stamp_ns)
         bias = values.atConstantBias(keys.bias(j))
         state = nav_state(values, k)
-        pim = links.integrate(before_ns, stamp_ns, gtsam.imuBias.ConstantBias(), Going.of(state, bias))
+        pim = links.integrate(before_ns, stamp_ns, gtsam.imuBias.ConstantBias(), GapMotion.of(state, bias))
         there = pim.predict(state, bias)
         window.guess(keys.pose(k + 1), there.pose(), t)
         window.guess(keys.velocity(k + 1), np.asarray(there.velocity()), t)
@@ -220,7 +221,7 @@ class States:
         for k in sorted(stale):
             if k in self._links and window.remove(self._links[k]):
                 j, values = timeline.slow_of[k], window.values
-                going = Going.of(nav_state(values, k), values.atConstantBias(keys.bias(j)))
+                going = GapMotion.of(nav_state(values, k), values.atConstantBias(keys.bias(j)))
                 pim = links.integrate(
                     timeline.stamps_ns[k], timeline.stamps_ns[k + 1], gtsam.imuBias.ConstantBias(), going
                 )

@@ -30,10 +30,11 @@ from graphloc.online._live import live_problem
 from graphloc.online._odometry import Odometry
 from graphloc.online._persistent import PersistentState
 from graphloc.online._propagate import advance_odometry, propagate, unpropagated
+from graphloc.online._receiver_checks import FROZEN_ONLINE
 from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
-from graphloc.solve.wrong_imu import WHY
+from graphloc.solve.wrong_imu import WRONG_IMU
 from graphloc.time import duration_ns, stamps_of, utc_text
 from graphloc.trajectory import Trajectory
 
@@ -41,7 +42,7 @@ log = logging.getLogger(__name__)
 _AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
 _PENDING = 10_000  # measurements that may wait for the IMU
 _TOLD_S = 60.0  # of data, by which the motion may tell a heading that was a guess
-_FROZEN = "frozen receiver: it repeats one position while the vessel moves; its fixes are rejected until it moves"
+_FROZEN = f"{FROZEN_ONLINE}; its fixes are rejected until it moves"
 _NO_LONGER_FROZEN = "no longer frozen: its fixes are used again"
 
 
@@ -151,7 +152,7 @@ class Tracking:
                 self._held_out = []
         if self._doubt.leaves_out(m.stamp_ns):
             self._held_out.append(m)
-            self._ledger.drop(m, Outcome.REJECTED, WHY)
+            self._ledger.drop(m, Outcome.REJECTED, WRONG_IMU)
             return
         if hole is not None:
             self._holes.append(hole)
@@ -288,7 +289,7 @@ class Tracking:
             now = propagate(lag.problem, newest, self._odometry, stamp_ns)
         heading = persistent.heading
         guess, heading_var = (heading.doubt(now.stamp_ns), heading.var(now.stamp_ns)) if heading else ("", 0.0)
-        wrong = f"{self._setup.imu_name} {WHY}" if self._doubt.leaves_out(now.stamp_ns) else ""
+        wrong = f"{self._setup.imu_name} {WRONG_IMU}" if self._doubt.leaves_out(now.stamp_ns) else ""
         doubts = (persistent.heading_check.said, guess, lag.in_doubt(now.stamp_ns), wrong)
         return estimate_of(
             now,
@@ -318,9 +319,10 @@ class Tracking:
         return sorted(again, key=lambda m: m.stamp_ns)
 
     def told_by(self) -> tuple[list[Measurement], float]:
-        """Return by stamp what the motion has told a heading by, and about what yaw it begins with, by the gyroscope as it is, rad.
+        """Return the data by which the motion has told a heading, by stamp, and about what yaw, rad, the body had at the first of them.
 
-        What has a row, or gets one with the window, is without (seq -1).
+        The gyroscope carries the yaw of the newest state back to there, its bias not removed. Data whose ledger row is written, or will
+        be written with the window, have no arrival number (seq -1).
         """
         lag = self.lag
         since_ns = min(lag.newest.stamp_ns - duration_ns(_TOLD_S), lag.first_ns)
@@ -468,7 +470,7 @@ class Tracking:
         if said_before:
             return ""
         return (
-            f"{self._setup.imu_name}: from {utc_text(since_ns)} on it {WHY} ({', '.join(sorted(denied))}): its samples are left out, as in "
+            f"{self._setup.imu_name}: from {utc_text(since_ns)} on it {WRONG_IMU} ({', '.join(sorted(denied))}): its samples are left out, as in "
             "an IMU gap, until they fit again"
         )
 

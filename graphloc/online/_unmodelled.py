@@ -28,7 +28,8 @@ import numpy as np
 
 from graphloc import keys
 from graphloc.frames import Array, skew
-from graphloc.graph import Going, InertialLink, SlowProcess
+from graphloc.graph import SlowProcess
+from graphloc.inertial import GapMotion, InertialLink
 from graphloc.motion_model import MotionModel
 from graphloc.online._anchor import in_world, sound
 from graphloc.online._live import LiveProblem, LiveStream
@@ -86,11 +87,14 @@ class UnmodelledError:
     def at(
         cls, problem: LiveProblem, newest: Newest, P: Array, begun: BeforeStart | None, last: ErrorSizes | None
     ) -> UnmodelledError | None:
-        """Return that of the first state of a window, where the position is off by all of the errors; None where there is nothing of that.
+        """Return the error of a window's first state, whose position is off by the whole of each left-out error.
+
+        None where no error is left out and the IMU's mount is known exactly.
 
         Args:
-            newest, P: that state. begun: what has been done to it before; None: nothing. last: as it was last, taken where it has the
-                size for these streams; None: not known.
+            newest, P: first state, and its covariance without these errors.
+            begun: what the errors did to that state before the window began; None: nothing.
+            last: sizes at the end of the window before, taken over where their shapes fit these streams; None: there are none.
         """
         streams = problem.streams
         left_out = untold_errors(list(streams.values()))
@@ -239,7 +243,9 @@ def _by_motion_model(
 def _step(before: Newest, newest: Newest, links: InertialLink) -> tuple[Array, Array]:
     """Return F and Q (15, 15), in axes of world, from one state to the next, by the IMU."""
     start = gtsam.NavState(before.pose, before.velocity)
-    pim = links.integrate(before.stamp_ns, newest.stamp_ns, gtsam.imuBias.ConstantBias(), Going.of(start, before.bias))
+    pim = links.integrate(
+        before.stamp_ns, newest.stamp_ns, gtsam.imuBias.ConstantBias(), GapMotion.of(start, before.bias)
+    )
     there, values = pim.predict(start, before.bias), gtsam.Values()
     for k, state in enumerate((start, there)):
         values.insert(keys.pose(k), state.pose())

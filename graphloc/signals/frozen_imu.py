@@ -21,7 +21,7 @@ LEAST_S, FEWEST = 0.2, 10
 they measure, and quantised readings at rest, repeat for less."""
 RATES_LEAST_S, RATES_FEWEST = 1.0, 50
 """The same for the three rates alone: fewer axes repeat by chance more easily."""
-WHY = "frozen: it repeats one sample (or its three rates) bit for bit while the stamps advance; check the sensor and its driver"
+FROZEN_IMU = "frozen: it repeats one sample (or its three rates) bit for bit while the stamps advance; check the sensor and its driver"
 
 
 def frozen_samples(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:
@@ -58,7 +58,7 @@ def frozen_imu_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[n
         return []
     where = stretches(stamps_ns, bad)
     return [
-        f"{sensor}: for {where} {WHY}; {int(bad.sum())} samples rejected, the motion there is bridged as in an IMU gap"
+        f"{sensor}: for {where} {FROZEN_IMU}; {int(bad.sum())} samples rejected, the motion there is bridged as in an IMU gap"
     ]
 
 

@@ -24,14 +24,14 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, GnssVelocity, Measurement, world_from_fixes
 from graphloc.recording import Recording
 from graphloc.signals.frozen_imu import stretches
-from graphloc.signals.series import runs
+from graphloc.signals.series import line_fit, runs
 from graphloc.time import NS_PER_S, stamps_of
 
 _M = TypeVar("_M", bound=Measurement)
 FROZEN = "frozen receiver"
 """How the reason begins for which a fix of one is rejected, offline and online."""
-WHY = f"{FROZEN} or driver: it repeats one position while the vessel moves"
-WHY_VELOCITY = "frozen receiver or driver: it repeats one velocity bit for bit"
+FROZEN_FIX = f"{FROZEN} or driver: it repeats one position while the vessel moves"
+FROZEN_VELOCITY = f"{FROZEN} or driver: it repeats one velocity bit for bit"
 # A stretch of one position; a driver that repeats fixes does so for less (`frontends/_fixes.py`).
 HELD_S, FEWEST = 2.5, 3
 _NOISE_M = 0.5  # how far the fixes of one position may scatter
@@ -210,11 +210,9 @@ def _before(t_s: Array, first: int) -> NDArray[np.int64]:
 
 def speed_of(t_s: Array, places_m: Array) -> tuple[float, float]:
     """Return the speed (m/s) of a straight line through places (N, 2), m, at times (N,), s, and its sigma from the residuals."""
-    dt = t_s - t_s.mean()
-    square = max(float(dt @ dt), 1e-9)
-    v = dt @ (places_m - places_m.mean(axis=0)) / square
-    left = places_m - places_m.mean(axis=0) - np.outer(dt, v)
-    return float(np.linalg.norm(v)), float(np.sqrt((left**2).sum() / max(2 * len(t_s) - 4, 1) / square))
+    line = line_fit(t_s, places_m)
+    scatter_m = float(np.sqrt((line.left**2).sum() / max(2 * len(t_s) - 4, 1)))
+    return float(np.linalg.norm(line.slope)), scatter_m * line.sigma
 
 
 def frozen_velocities(stamps_ns: NDArray[np.int64], v_mps: Array) -> NDArray[np.bool_]:
@@ -241,7 +239,7 @@ def frozen_fixes_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray
     """Return a line on what `frozen_fixes` found."""
     if not bad.any():
         return []
-    return [f"{sensor}: for {stretches(stamps_ns, bad)} {WHY}; {int(bad.sum())} fixes rejected"]
+    return [f"{sensor}: for {stretches(stamps_ns, bad)} {FROZEN_FIX}; {int(bad.sum())} fixes rejected"]
 
 
 def without_frozen_fixes(
@@ -262,10 +260,10 @@ def without_frozen_fixes(
         bad = frozen_velocities(stamps_ns, v_mps)
         hanging = runs(bad & (np.linalg.norm(v_mps, axis=1) > UNDER_WAY_MPS))
         hung = np.vstack([hung, stamps_ns[hanging - [0, 1]]])
-        gone |= {m.seq: WHY_VELOCITY for m, b in zip(velocities, bad, strict=True) if b}
+        gone |= {m.seq: FROZEN_VELOCITY for m, b in zip(velocities, bad, strict=True) if b}
         if bad.any():
             said.append(
-                f"{sensor}: for {stretches(stamps_ns, bad)} {WHY_VELOCITY}; {int(bad.sum())} velocities rejected"
+                f"{sensor}: for {stretches(stamps_ns, bad)} {FROZEN_VELOCITY}; {int(bad.sum())} velocities rejected"
             )
     for sensor, fixes in _by_sensor(recording, GnssPosition, receivers).items():
         stamps_ns, lat_lon = stamps_of(fixes), np.array([m.position[:2] for m in fixes])
@@ -273,7 +271,7 @@ def without_frozen_fixes(
         # One receiver, or its driver, says both.
         meanwhile = np.any((stamps_ns[:, None] >= hung[:, 0]) & (stamps_ns[:, None] <= hung[:, 1]), axis=1)
         bad[1:] |= np.all(lat_lon[1:] == lat_lon[:-1], axis=1) & meanwhile[1:]
-        gone |= {m.seq: WHY for m, b in zip(fixes, bad, strict=True) if b}
+        gone |= {m.seq: FROZEN_FIX for m, b in zip(fixes, bad, strict=True) if b}
         said += frozen_fixes_warning(sensor, stamps_ns, bad)
     if not gone:
         return recording, said

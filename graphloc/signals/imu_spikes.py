@@ -16,7 +16,7 @@ from graphloc.frames import Array
 from graphloc.measurements import ImuSample
 from graphloc.time import NS_PER_S, utc_text
 
-WHY = "a spike: the samples before and after it agree; check cable and driver"
+IMU_SPIKE = "a spike: the samples before and after it agree; check cable and driver"
 LONGEST = 2
 """Number of samples in a row that may be one spike."""
 _LEAST = np.repeat([40.0, 0.5], 3)  # m/s^2, rad/s: what leaps by less does little harm
@@ -57,7 +57,7 @@ def spike_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.boo
     if not bad.any():
         return []
     first = utc_text(int(stamps_ns[np.flatnonzero(bad)[0]]))
-    return [f"{sensor}: {int(bad.sum())} samples rejected, the first at {first}: each is {WHY}"]
+    return [f"{sensor}: {int(bad.sum())} samples rejected, the first at {first}: each is {IMU_SPIKE}"]
 
 
 def _limit(recent: Array) -> Array:

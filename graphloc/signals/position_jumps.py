@@ -18,26 +18,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.graph import SlowProcess
-from graphloc.time import NS_PER_S, utc_text
+from graphloc.time import NS_PER_S, duration_ns, utc_text
 
 LASTS_S = 200.0
 """For so long (s) before and after a jump either side may be the wrong one: about as long as a slow error lasts."""
-# Metres: 4 m/s^2 that come and go within three seconds; times the usual step difference; number of fixes that give the latter.
-_JUMP_M, _JUMP, _FEWEST = 3.0, 10.0, 10
+_JUMP_M = 3.0  # at a fix per second: 4 m/s^2 that come and go within three seconds
+_JUMP = 10.0  # times the usual difference between a step and those beside it
+_FEWEST = 10  # fixes that give the latter; in its neighbourhood so many on either side
 _AROUND = 0.75  # share of the local median, which is usually above that of the whole run
-_SIGMAS, _BRAKES_MPS2 = 10.0, 10.0  # stated sigmas; emergency braking of a car to a stop
+_SIGMAS = 10.0  # stated ones of a fix: less is its noise
+_BRAKES_MPS2 = 10.0  # emergency braking of a car to a stop between two fixes: less is its motion
 _EVEN = 1.5  # steps in time that differ by more than this factor are not compared
-_IN_BOUNDS = 1.5  # sigmas of the slow error that the bounds include: jumps up to there need no word
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
-# Off a track: fixes on either side of a jump are compared for so long, and at least so many, of which as many lie on their side, as two
-# outliers in a row are no jump (of fixes that are farther apart than that two, as the track follows after these); by how many sigmas of
-# that they differ, and by how much at least; what share of it comes from one fix to the next, as where track and fixes part otherwise they
-# do so little by little.
-_BESIDE_S, _FEWEST_BESIDE, _SLOW_S, _OFF_SIGMAS, _OFF_M, _AT_ONCE = 2.0, 3, 2.5, 8.0, 1.0, 0.5
+# Off a track the medians of the fixes on either side of a jump are compared.
+_BESIDE_S = 2.0  # of either side
+_FEWEST_BESIDE = 3  # fixes on either side, at least, of which as many lie there: two outliers in a row are no jump
+_SLOW_S = 2.5  # between fixes, from which two on either side are enough: the track follows after these
+_OFF_SIGMAS = 8.0  # of the difference of two medians
+_OFF_M = 1.0  # least difference
+_AT_ONCE = 0.5  # share of it that comes from one fix to the next: where track and fixes part otherwise they do so little by little
 _GAP = 3.0  # times the usual time between fixes
 _KEPT = 200  # so that memory stays bounded: ten seconds of a receiver at 20 Hz; a choice
-_FITS_SIGMAS, _CERTAIN_SIGMAS = 5.0, 8.0  # off a prediction
+_FITS_SIGMAS = 5.0  # off its prediction, up to which the fix before a jump fits
+_CERTAIN_SIGMAS = 8.0  # off its prediction, from which the fix after a jump does not
 _SAME, _SAME_SIGMAS = 0.25, 3.0  # off a prediction by the same: within this share and so many sigmas
 _ENDS = 10.0  # odds that a jump is over
 _IMU_OFF_MPS2 = 1.0  # by how much an IMU may be wrong: gravity where it is tilted by 6 deg
@@ -68,7 +71,7 @@ def position_jumps(
 
     Args:
         stamps_ns: (N,), increasing. places_m: (N, 2), in a local level frame. sigma_m: (N,) as stated.
-        allowed_m: jumps that the bounds already include (`allowed_jump_m`).
+        allowed_m: jumps that the bounds already include (`build.allowed_jump_m`).
     """
     if len(stamps_ns) < _FEWEST:
         return np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -104,7 +107,7 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
 
     Args:
         stamps_ns: (N,), increasing. off_m: (N, 2) fixes less the track.
-        allowed_m: jumps that the bounds already include (`allowed_jump_m`).
+        allowed_m: jumps that the bounds already include (`build.allowed_jump_m`).
     """
     dt_s = np.diff(stamps_ns) / NS_PER_S
     usual_s = float(np.median(dt_s)) if len(dt_s) else np.inf
@@ -135,15 +138,6 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
         left_m[max(found[-1] - n + 1, 0) : found[-1] + n] = 0.0
     at = np.sort(np.array(found, dtype=np.int64))
     return stamps_ns[at + n], size_m[at]
-
-
-def allowed_jump_m(slow: SlowProcess | None) -> float:
-    """Return the size (m) up to which the bounds include a jump.
-
-    Args:
-        slow: the slow error (east, north, ...) of a receiver, estimated or added to the bounds; None: it has none.
-    """
-    return 0.0 if slow is None else float(_IN_BOUNDS * slow.sigma[:2].max())
 
 
 def _parts(steps_m: Array) -> Array:
@@ -306,7 +300,7 @@ class JumpDetector:
         stamps_ns, sigmas_m = np.array([at for at, _, _ in self._seen]), np.array([s for _, _, s in self._seen])
         places_m = np.array([p for _, p, _ in self._seen])
         at_ns, _ = position_jumps(stamps_ns, places_m, sigmas_m, allowed_m=allowed_m)
-        until_ns = min(stamps_ns[-3], stamp_ns - int(_BURST_S * NS_PER_S))  # a later one may yet be a burst
+        until_ns = min(stamps_ns[-3], stamp_ns - duration_ns(_BURST_S))  # a later one may yet be a burst
         new = (at_ns > self._judged_ns) & (at_ns <= until_ns)
         self._judged_ns = max(int(until_ns), self._judged_ns)
         known_ns = [jump.after_ns for jump in self.jumps]

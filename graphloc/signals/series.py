@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,26 @@ def integral(t_s: Array, values: NDArray[Any]) -> NDArray[Any]:
     """Return the running integral of values (N, ...) over times (N,), by trapezia; real or complex, 0 at first."""
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t_s).reshape(-1, *[1] * (values.ndim - 1))
     return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(steps, axis=0)])
+
+
+class LineFit(NamedTuple):
+    """Straight line through values (N, k) over time, by least squares.
+
+    Attributes:
+        slope: (k,) per s. left: (N, k) residuals. sigma: of a component of the slope, per unit sigma of the values.
+    """
+
+    slope: Array
+    left: Array
+    sigma: float
+
+
+def line_fit(t_s: Array, values: Array) -> LineFit:
+    """Return the straight line through values (N, k) at times (N,)."""
+    dt, around = t_s - t_s.mean(), values - values.mean(axis=0)
+    square = max(float(dt @ dt), 1e-9)  # all at one time: a slope that tells nothing
+    slope = dt @ around / square
+    return LineFit(slope, around - np.outer(dt, slope), 1.0 / float(np.sqrt(square)))
 
 
 def rms(values: Array) -> float:

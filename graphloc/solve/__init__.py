@@ -13,7 +13,8 @@ import numpy as np
 from graphloc.build import make_problem, rows_of
 from graphloc.config import VesselConfig
 from graphloc.frames import Datum
-from graphloc.graph import InertialRow, Sensor
+from graphloc.graph import Sensor
+from graphloc.inertial import InertialRow
 from graphloc.offsets import Probe
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution

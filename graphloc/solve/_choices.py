@@ -31,6 +31,7 @@ from graphloc.solve.decide import (
     weigh,
 )
 from graphloc.solve.stretch import copy_states, solve_until_written_there, update_states, weak_prior
+from graphloc.time import duration_ns
 
 # A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
 # short enough to dead-reckon through.
@@ -172,7 +173,7 @@ def _state_of(problem: Problem, key: tuple[int, int]) -> int:
 
 def _index_around(problem: Problem, k: int, seconds: float) -> int:
     stamps = problem.timeline.stamps_ns
-    return int(np.clip(np.searchsorted(stamps, stamps[k] + int(seconds * 1e9)), 0, len(stamps) - 1))
+    return int(np.clip(np.searchsorted(stamps, stamps[k] + duration_ns(seconds)), 0, len(stamps) - 1))
 
 
 class _Around(NamedTuple):

@@ -12,7 +12,7 @@ from graphloc.build import Past, Problem, StartPrior, without_imu
 from graphloc.recording import Progress
 from graphloc.solve._marginals import marginals
 from graphloc.solve._passes import cost_as_configured
-from graphloc.solve.bias_walk import KEYS, BiasWanders, KnownBias, known_bias, went_too_far
+from graphloc.solve.bias_walk import WALK_KEYS, BiasWanders, KnownBias, known_bias, went_too_far
 from graphloc.solve.decide import PredictedCovariance, Stage, Verdicts, agrees, decisions, predicted_by, weigh
 from graphloc.solve.stretch import (
     StretchStep,
@@ -24,6 +24,7 @@ from graphloc.solve.stretch import (
     update_states,
 )
 from graphloc.solve.wrong_imu import GrownWindow, ImuWrong, wrong_span
+from graphloc.time import duration_ns
 
 _CHUNK_S, _OVERLAP_S = 15.0, 5.0
 _SETTLED_M = 0.5  # coarse, to save rounds: passes over the whole run follow, which end at `_passes.SETTLED_M`; a choice
@@ -67,8 +68,8 @@ def grow(
         problem, step, verdicts, more = found
         iterations += more
     while known < end:
-        until = int(min(np.searchsorted(stamps, stamps[known] + int(chunk_s * 1e9)), end))
-        back = problem.timeline.floor(int(stamps[known]) - int(overlap_s * 1e9))
+        until = int(min(np.searchsorted(stamps, stamps[known] + duration_ns(chunk_s)), end))
+        back = problem.timeline.floor(int(stamps[known]) - duration_ns(overlap_s))
         start_of_window = int(np.searchsorted(slow_of, slow_of[back]))
         if start_of_window > first and slow_of[start_of_window] < slow_of[known]:
             prior = past_at(problem, step, start_of_window)
@@ -118,7 +119,7 @@ def _wanders(
     except np.linalg.LinAlgError:  # some data do not determine them
         return None
     found = [w for n, now in enumerate(known) if (w := went_too_far(known[:n], now, problem.links)) is not None]
-    return BiasWanders({KEYS[k]: times for k, times in found[-1:]}) if found else None
+    return BiasWanders({WALK_KEYS[k]: times for k, times in found[-1:]}) if found else None
 
 
 def _solve_grown(window: GrownWindow) -> tuple[int, StretchStep, Verdicts]:

@@ -134,11 +134,15 @@ def at_usual_level(
 
 
 class _Span(NamedTuple):
-    """An outage, from the last fix to the next one, and where the one before it ends and the one after it begins (stamps, ns).
+    """An outage, and where the levels of slow errors beside it are looked for (stamps, ns).
 
     Attributes:
-        of: number of the stream whose error is drawn anew there; None: of all receivers, whose error goes on.
-        back_ns: where that is drawn anew next, and another level ends; None: the run ends first.
+        gap_ns: of the last fix before the outage, and of the first after it.
+        from_ns, until_ns: where levels are looked for: in an outage of all receivers the parts before and after it, in one of a stream
+            the part after it; None: from the begin of the run, or to its end.
+        of: number of the stream whose error is drawn anew in the outage; None: an outage of all receivers, whose errors go on.
+        back_ns: gap in which that stream's error is drawn anew next, where another level ends; None: the run ends before that, or the
+            errors go on.
     """
 
     gap_ns: tuple[int, int]

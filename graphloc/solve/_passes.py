@@ -48,6 +48,10 @@ def optimise_run(
     """Optimise the whole run with the given decisions."""
     last, made = len(problem.timeline) - 1, Made()
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, jumps=jumps, made=made)
+    return _iterated(graph, guess, made)
+
+
+def _iterated(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values, made: Made) -> Optimised:
     solved = optimize(graph, guess, 12, 1e-3)
     return Optimised(solved.values, graph, made, solved.iterations, moved(guess, solved.values))
 
@@ -59,8 +63,7 @@ def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, pri
     values, promised = full_step(graph, guess)
     before, after = float(graph.error(guess)), float(graph.error(values))
     if not after < _UPHILL * before + 1.0:
-        solved = optimize(graph, guess, 12, 1e-3)
-        return Optimised(solved.values, graph, made, solved.iterations, moved(guess, solved.values))
+        return _iterated(graph, guess, made)
     return Optimised(values, graph, made, 1, moved(guess, values), max(promised, abs(before - after)))
 
 

@@ -20,7 +20,7 @@ from graphloc.signals.position_jumps import MEAN_S
 from graphloc.solve._final_passes import RunChoice
 from graphloc.solve._levels import COMES_BACK_OFF, OUTAGE_S
 from graphloc.solve.decide import Verdicts, far_sigmas, met
-from graphloc.time import NS_PER_S, stamps_of, utc_text
+from graphloc.time import NS_PER_S, duration_ns, stamps_of, utc_text
 
 _CONVERGES_S = 60.0  # for so long after an outage its fixes are doubted
 _CONVERGED = 0.75  # of that time, in which it must have
@@ -147,7 +147,7 @@ def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Retu
 def _returns(stream: Stream) -> list[Return]:
     stamps_ns = stamps_of(stream.measurements)
     back = np.flatnonzero(np.diff(stamps_ns) > OUTAGE_S * NS_PER_S) + 1
-    ends = np.searchsorted(stamps_ns, stamps_ns[back] + int(_CONVERGES_S * NS_PER_S))
+    ends = np.searchsorted(stamps_ns, stamps_ns[back] + duration_ns(_CONVERGES_S))
     # A third of them must tell the place afterwards, before the next outage.
     until = np.minimum(ends, back + 2 * np.diff(back, append=len(stamps_ns)) // 3)
     pairs = zip(back.tolist(), until.tolist(), strict=True)

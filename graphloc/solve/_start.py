@@ -27,6 +27,7 @@ from graphloc.solve._passes import expected_cost
 from graphloc.solve.alignment import Start, start_pose
 from graphloc.solve.decide import Stage, cost_of_noise, decisions, weigh
 from graphloc.solve.stretch import copy_states, dead_reckon, fill_slow, solve_stretch
+from graphloc.time import duration_ns
 
 # Starts that cost this much more (log-likelihood) are dropped; while several remain, the window grows.
 _COST_APART, _LONGEST_S, _LONGEST_UNTOLD_S = 8.0, 60.0, 600.0
@@ -273,4 +274,4 @@ def _solve_candidate(
 
 def _index_after(problem: Problem, seconds: float) -> int:
     stamps = problem.timeline.stamps_ns
-    return int(min(np.searchsorted(stamps, stamps[0] + int(seconds * 1e9)), len(stamps) - 1))
+    return int(min(np.searchsorted(stamps, stamps[0] + duration_ns(seconds)), len(stamps) - 1))

@@ -27,10 +27,13 @@ from graphloc.time import utc_text
 _USUAL_SPEED_MPS = 10.0  # 1 sigma, where the speed is unknown
 _CARRIED_RAD = np.radians(20.0)  # error by gyro bias, 1 sigma: from later on, a heading is no longer one of the start
 _OWN_TILT_RAD = 0.5  # 1 sigma of roll and pitch, without accelerometer data
-# Travel from which the motion may tell the heading: so many times what places are off by, or drift by within so long. Few are enough
-# beyond the usual travel, and where there never is more and nothing else tells it; below the least, an antenna sways, and later than
-# the latest, fixes have drifted as far.
-_MANY, _FEW, _DRIFT_S, _LEAST_M, _USUAL_M, _LATEST_S = 20.0, 5.0, 30.0, 1.0, 15.0, 120.0
+# Travel from which the motion may tell the heading, by how far places are off (noise, and drift of their slow error).
+_MANY = 20.0  # times that: the travel that is waited for
+_FEW = 5.0  # times that: enough beyond `_USUAL_M`, and where the vessel never goes farther and nothing else tells the heading
+_DRIFT_S = 30.0  # in which a slow error drifts
+_LEAST_M = 1.0  # by less an antenna sways
+_USUAL_M = 15.0  # more is not waited for, unless `_FEW` asks for it
+_LATEST_S = 120.0  # up to which few are enough where there never is more: later, fixes have drifted as far
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

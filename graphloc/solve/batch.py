@@ -2,21 +2,21 @@
 """The offline solver: align, grow, then decide over the whole run.
 
 1. Align over a window; try each candidate heading on it and keep the cheapest (`alignment`, `_start`).
-2. Grow by some seconds at a time, each window solved with a prior from earlier data. Hypotheses that are
-   new in a window are judged by the prediction without them, with its covariance (`_grow`). Both on a
-   thinned run (`graphloc.build.thinned`). Passes over all of it remove the seams: there they cost a fifth.
-3. Passes over the whole run: modes and weights re-chosen until they no longer change (`_passes`).
-4. Try other choices that may be more probable (`_choices`), and repeat 3 where there are any. Where that shows position
-   jumps of the only position sensor, 1 to 4 are repeated with them (`_jumps`); where the first fixes after an outage bend the track,
-   without these (`_returns`). Where the IMU's mount is clearly off, repeat 3 with it turned (`imu_mount`).
+2. Grow the solved part by some seconds at a time. Each window is solved with a prior from earlier data; hypotheses that are
+   new in it are judged by the prediction without them, with its covariance (`_grow`). Steps 1 and 2 use a thinned run
+   (`graphloc.build.thinned`). Passes over all of it then remove the seams between windows, at a fifth of the cost.
+3. Pass over the whole run, re-choosing modes and weights, until they no longer change (`_passes`).
+4. Try other choices that may be more probable (`_choices`), and repeat 3 where one is. Repeat 1 to 4 with position jumps of the only
+   position sensor, where the solution shows some (`_jumps`), and without the first fixes after an outage, where these bend the
+   track (`_returns`). Repeat 3 with the IMU's mount turned, where it is clearly off (`imu_mount`).
 5. Where receivers jump and no other sensor measures position, choose the most probable level (`_levels`).
-6. The last graph gives the covariances of every state (`_marginals`).
+6. Compute the covariances of every state from the last graph (`_marginals`).
 
-Where no sensor measures position or velocity for a while, 3 to 6 have the motion model (`graphloc.motion_model`).
-Sensors that scatter more than they state are taken as they scatter, and 3 and 4 repeated.
-Where the IMU contradicts the other sensors, or one of heading or velocity disagrees for long, 1 to 4 are tried without such a sensor,
-and then with all from there. If the IMU contradicts them still, its noise is scaled up, and 3 and 4 are repeated, beginning with
-gentle losses; where that explains little, it is not the IMU, and its noise stays as configured.
+Where no sensor measures position or velocity for a while, 3 to 6 include the motion model (`graphloc.motion_model`).
+Where sensors scatter more than they state, 3 and 4 are repeated with the scatter as their noise.
+Where the IMU contradicts the other sensors, or a sensor of heading or velocity disagrees for long, 1 to 4 are tried without such a
+sensor, and repeated with all sensors from that solution. Where the IMU still contradicts the others, its noise is scaled up, and 3 and
+4 are repeated, beginning with gentle losses. If that explains little, the IMU is not to blame, and its noise stays as configured.
 """
 
 from __future__ import annotations
@@ -46,35 +46,35 @@ from graphloc.solve.imu_noise import CONTRADICTION, noise_step, with_needed_nois
 from graphloc.solve.sensor_noise import scattering
 
 _MAX_NOISE_ROUNDS, _MAX_JUMP_ROUNDS, _MAX_WALK_ROUNDS = 4, 2, 3
-# Nats by which each jump must make a run more probable: which of a thousand fixes it is at and what it leads to, of a hundred places
-# along each axis, are worth 16; in 25 of 27 runs with jumps each did by over 30, between high houses, where fixes wander, by 15 to 20.
+# Nats by which each jump must make a run more probable. To say at which of a thousand fixes it is, and to which of a hundred places along
+# each of two axes it leads, takes 16. In 25 of 27 runs with jumps each gave over 30; between high houses, where fixes wander, 15 to 20.
 _OF_A_JUMP = 25.0
-_OPEN_PASSES = 4  # at most, with each gentle loss, where the IMU's noise has changed
-# More noise of the IMU explains a misfit if it falls below what contradicts it, or by this factor; else the noise stays as configured.
+_OPEN_PASSES = 4  # most passes with each gentle loss, after the IMU's noise has changed
+# More noise of the IMU explains a misfit if that falls below what counts as a contradiction, or by this factor.
 _EXPLAINED = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchResult:
-    """The solved graph, before it is turned into a `Solution`; `problem` has the noise that it was solved with, `stated` that as configured."""
+    """The solved graph, before it is turned into a `Solution`."""
 
-    problem: Problem
-    stated: Problem
+    problem: Problem  # with the noise that it was solved with
+    stated: Problem  # with the noise as configured
     values: gtsam.Values
     verdicts: Verdicts
     cov: dict[int, Array]  # of each key
     graph: gtsam.NonlinearFactorGraph
     passes: int
     iterations: int
-    cost: float  # 2 x that of the graph, without outliers
+    cost: float  # 2 x the graph's cost, without outliers: a chi-square where the model holds
     converged: bool
     noise_scale: float
     prior: StartPrior
-    headings: int  # number of candidates that explain the start about equally well; 0: nothing tells the heading there
-    heading_var: Array  # (N,) rad^2 of each state, by headings that the motion does not exclude (see `_start`)
-    begun: int  # last state of the first window: what comes later is not in `heading_var`
-    levels_cov: Array  # (N, 3, 3) of the positions, m^2, by other levels that may be the usual ones (see `_levels`)
-    mount: MountError | None  # what is known of that of the IMU (see `imu_mount`); None: not reckoned for this graph
+    headings: int  # number of candidate headings that explain the start about equally well; 0: nothing tells the heading there
+    heading_var: Array  # (N,) rad^2 to add to the heading of each state, as the motion does not exclude other headings (see `_start`)
+    begun: int  # last state of the first window: `heading_var` knows nothing of later data
+    levels_cov: Array  # (N, 3, 3) m^2 to add to the positions, as other levels may be the usual ones (see `_levels`)
+    mount: MountError | None  # how far the IMU is off its mount (see `imu_mount`); None: not estimated for this graph
     notes: tuple[str, ...]
 
     def lightened(self) -> BatchResult:
@@ -94,13 +94,15 @@ def solve_batch(
     """Solve a whole run.
 
     Args:
-        newest: `heading_var` is asked for at the last state alone.
-        doubt_imu: whether to look for spans in which the IMU is wrong. doubt_returns: for fixes after outages that lead astray.
-        near_rad: yaw at the start, if the motion alone tells it: the only one that is tried.
+        newest: whether only the last state is of interest, as for a start of the online mode: `heading_var` is then that of the last
+            state, and jumps, returns after outages and the IMU's mount are not looked for.
+        doubt_imu: whether to look for spans in which the IMU is wrong. doubt_returns: whether to look for fixes after outages that
+            lead the track astray.
+        near_rad: yaw at the start, rad: the only candidate where the motion alone tells the heading; None: all are tried.
 
     Raises:
-        ImuWrong: there are some.
-        SolveError: it could not be started, or the linear algebra failed.
+        ImuWrong: there are spans in which the IMU is wrong.
+        SolveError: the run could not be started, or the linear algebra failed.
     """
     run = _Underway(problem, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
     run.raise_bias_walk()
@@ -120,14 +122,14 @@ def solve_batch(
 
 
 class _Underway:
-    """A run on its way through the steps of `solve_batch`, each of which leaves another solution in its place.
+    """A run on its way through the steps of `solve_batch`, each of which may replace the solution by a better one.
 
-    It alone refers to the solution: of a run of hours the graph takes gigabytes, and must be gone before the next one is made.
+    Nothing else refers to the solution: the graph of a run of hours takes gigabytes, and must be freed before the next one is made.
 
     Attributes:
-        begun, solved: the solution, and the start that it was grown from.
-        passes, iterations: that it took.
-        mount: what the solution says of the mount of the IMU; None: not reckoned for this one.
+        begun: the start that the solution was grown from. solved: the solution.
+        passes, iterations: number of those that it took.
+        mount: how far the IMU is off its mount by the solution; None: not estimated for this one.
     """
 
     def __init__(
@@ -138,7 +140,7 @@ class _Underway:
         self._solve_first(problem)
 
     def _solve_first(self, problem: Problem) -> None:
-        """Solve a problem from its start; with biases that wander farther, where these make the IMU seem wrong."""
+        """Solve a problem from its start, with more walk of the IMU's biases where they go farther than configured."""
         for _ in range(_MAX_WALK_ROUNDS):
             try:
                 self._hold(*self._solve(problem))
@@ -150,7 +152,7 @@ class _Underway:
         self._problem = problem
 
     def _hold(self, begun: Begun, solved: SolvedRun, mount: MountError | None = None) -> None:
-        """Hold a solution, and count what it took from its start."""
+        """Hold a solution that was found from a start, with the passes and iterations that it took."""
         self.begun, self.solved, self.mount = begun, solved, mount
         self.passes, self.iterations = solved.settled.passes, begun.iterations + solved.settled.iterations
 
@@ -160,7 +162,7 @@ class _Underway:
         self._count(solved.settled.passes, solved.settled.iterations)
 
     def _count(self, passes: int, iterations: int) -> None:
-        """Add what was done to what the solution took."""
+        """Add passes and iterations to those that the solution took."""
         self.passes, self.iterations = self.passes + passes, self.iterations + iterations
 
     @property
@@ -169,7 +171,7 @@ class _Underway:
         return with_jumps_of(self._problem, self._configured)
 
     def raise_bias_walk(self) -> None:
-        """Solve it anew where the biases of the IMU wander by more than configured: the track is bent, and right hypotheses seem false."""
+        """Solve the run anew where the biases of the IMU go farther than configured: else the track is bent, and right hypotheses seem false."""
         for _ in range(_MAX_WALK_ROUNDS):
             problem, settled = self.solved
             if not problem.config.sensors[problem.imu.sensor].adapt_noise:
@@ -180,9 +182,9 @@ class _Underway:
                 return
 
     def raise_noise_of_sensors(self) -> None:
-        """Solve it anew where sensors that scatter more than they state may have misled a start by the motion alone.
+        """Solve the run anew where sensors that scatter more than they state may have misled a start by the motion alone.
 
-        It bends everything to fixes that state too little, and the IMU would be called noisier.
+        Such a start bends all states to fixes whose stated sigma is too small, and the IMU would be blamed for the misfit.
         """
         for _ in range(MAX_SENSOR_ROUNDS):
             if not self.begun.start.by_motion or self.solved.misfit() < CONTRADICTION:
@@ -193,7 +195,7 @@ class _Underway:
                 return
 
     def take_jumps(self) -> None:
-        """Solve it anew with the position jumps that the solution shows, while that is clearly more probable."""
+        """Solve the run anew with the position jumps that the solution shows, as long as that is clearly more probable."""
         for _ in range(_MAX_JUMP_ROUNDS):
             jumping = with_jumps_off_track(self._problem, self.solved.settled.verdicts)
             if jumping is None:
@@ -203,14 +205,14 @@ class _Underway:
                 return
 
     def leave_out_returns(self) -> None:
-        """Solve it anew without the first fixes after outages, if that is clearly more probable; not where the receiver jumps."""
-        # With the noise that the sensors were found to have: else it would be saved with their fixes.
+        """Solve the run anew without the first fixes after outages, if that is clearly more probable; not where the receiver jumps."""
+        # With the noise that the sensors were found to have: else leaving fixes out would save the cost of their larger scatter.
         whole, misfit = replace(self.solved.problem, usual_motion=None), self.solved.misfit()
         doubted = doubtful_returns(whole, self.solved.choice(), misfit)
         if doubted is None:
             return
         cost, times, before = self._cost(whole), max(misfit, 1.0), self._problem
-        # What the IMU is off by without fixes is no reason to doubt it.
+        # Without those fixes the IMU's drift shows, which is no reason to doubt the IMU.
         self._solve = partial(self._solve, doubt_imu=False)
         if not self._solved_anew(doubted.left_out_of(whole), cost - times * doubted.price(whole)):
             return
@@ -226,7 +228,7 @@ class _Underway:
         return cost_of_run(problem, self.solved.settled.values, self.begun.prior)
 
     def _solved_anew(self, other: Problem, lowest: float = np.inf) -> bool:
-        """Solve another problem from its start; return whether it could be, and costs less (nats) than the lowest: else the solution stays what it was."""
+        """Solve another problem from its start; return whether that succeeded and cost less than `lowest` (nats). If not, the solution stays."""
         problem, begun, before = self._problem, self.begun, self.solved.choice()
         del self.solved  # and its graph, before the next one is made
         try:
@@ -234,13 +236,13 @@ class _Underway:
             if lowest == np.inf or self._cost(other) < lowest:
                 return True
         except SolveError:
-            pass  # it cannot be solved so
+            pass  # the other problem cannot be solved
         self._problem = problem
         self._hold(begun, before.settled_again(begun.prior, self._progress))
         return False
 
     def estimate_mount(self) -> None:
-        """Turn the mount of the IMU to where the other sensors have it."""
+        """Estimate the mount of the IMU, and turn it where the other sensors show that it is off."""
         before = self.solved.settled
         problem, settled, prior, mount = with_mount_estimated(
             *self.solved, self.begun.prior, self._progress, LAST_PASSES
@@ -251,11 +253,11 @@ class _Underway:
         self._hold(self.begun._replace(prior=prior), SolvedRun(problem, settled), mount)
 
     def raise_imu_noise(self) -> Problem | None:
-        """Raise the noise of the IMU where the run needs it, round by round; where that explains little, it stays as configured.
+        """Raise the noise of the IMU where the run needs it, round by round; if that explains little, it stays as configured.
 
         Returns:
-            A problem that is to be solved instead, from its start: with noise that the residuals need, where only the smaller noise
-            excluded headings. Else None.
+            A problem with more noise, to be solved from its start, where the motion alone tells the heading: the smaller noise may have
+            excluded headings wrongly. Else None.
         """
         as_stated, misfit = self.solved.choice(), self.solved.misfit()
         left = misfit
@@ -275,9 +277,11 @@ class _Underway:
         return None
 
     def _with_noisier_imu(self, *, contradicted: bool) -> Problem | None:
-        """Return the problem with the noise of its IMU scaled up; where that does not contradict the others, as its residuals need it.
+        """Return the problem with more noise of the IMU; None where it needs none, or is not to be adapted (`adapt_noise`).
 
-        None where they need no more, or it is not to be adapted.
+        Args:
+            contradicted: whether the IMU contradicts the other sensors: all its noise is then scaled by their misfit. If not, the
+                gyroscopes' and the accelerometers' are raised to what their residuals need.
         """
         problem, settled = self.solved
         if not problem.config.sensors[problem.imu.sensor].adapt_noise:
@@ -287,7 +291,7 @@ class _Underway:
         return with_needed_noise(problem, settled.values, settled.verdicts, self.begun.prior)
 
     def _settle_with(self, noisier: Problem, *, gently: bool) -> None:
-        """Go on with other noise of the IMU; `gently`: with gentle losses first."""
+        """Settle the solution with other noise of the IMU; `gently`: with gentle losses first."""
         estimate, prior = self.solved.settled.values, self.begun.prior
         problem = bridged(noisier, estimate)
         if gently:

@@ -19,7 +19,7 @@ from scipy.special import chdtrc
 from graphloc import keys
 from graphloc.build import Past, Problem, StartPrior, with_imu_scaled
 from graphloc.frames import Array
-from graphloc.graph import InertialLink
+from graphloc.inertial import InertialLink
 from graphloc.solve.decide import Verdicts
 from graphloc.solve.imu_noise import components, squares_and_freedom
 from graphloc.solve.linearised import linearised, normal_solver
@@ -27,9 +27,11 @@ from graphloc.time import NS_PER_S
 
 WANDERS_S = 60.0
 """Time over which it is looked at how far a bias has gone."""
-KEYS = ("accel_bias_instability_ug", "gyro_bias_instability_deg_per_h")
+WALK_KEYS = ("accel_bias_instability_ug", "gyro_bias_instability_deg_per_h")
 """What is configured of accelerometers and gyroscopes."""
-_WANDERS = 3.0  # sigmas of its random walk over that: smoothed, a bias that walks so moves by less than two
+# Sigmas of its random walk over that, from which variance components are asked whether it needs more walk (`_UNLIKELY`): smoothed, a
+# bias that walks so moves by less than two. A warning alone, where the walk is not to be raised, has no such test and a higher bound.
+_LOOKED_AT = 3.0
 # Probabilities: of some ten looks every ten seconds one finds it by chance about once in 150 h; and that of each part of the time.
 _TOO_FAR, _A_PART = 1e-6, 0.01
 _MOST_STEP, _LEAST_STEP = 10.0, 1.3  # what is known is too sure as well, so more is not believed at once
@@ -145,7 +147,7 @@ def _needed(gone: Array) -> float:
 
 def with_needed_walk(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Problem | None:
     """Return the problem with as much walk of the biases as the run needs, where that is clearly more than it has; else None."""
-    high = wandered(problem, values) > _WANDERS
+    high = wandered(problem, values) > _LOOKED_AT
     if not high.any():
         return None
     rows = linearised(problem, values, verdicts, prior)
@@ -159,13 +161,13 @@ def with_needed_walk(problem: Problem, values: gtsam.Values, verdicts: Verdicts,
         needed, _ = components((rows.J, root, rows.b), parts, found, np.zeros(2, dtype=bool), high, [MOST_TIMES] * 2)
     except RuntimeError:  # not determined by normal equations; the solution stands
         return None
-    times = {key: float(t) for key, t in zip(KEYS, needed, strict=True) if t > _LEAST_TIMES}
+    times = {key: float(t) for key, t in zip(WALK_KEYS, needed, strict=True) if t > _LEAST_TIMES}
     return with_imu_scaled(problem, times) if times else None
 
 
 def walk_times(stated: Any, taken: Any) -> dict[str, float]:
     """Return by what factors the walk of the biases is larger in one configuration of an IMU than in another, by key; without those of 1."""
-    every = {key: getattr(taken, key) / getattr(stated, key) for key in KEYS}
+    every = {key: getattr(taken, key) / getattr(stated, key) for key in WALK_KEYS}
     return {key: times for key, times in every.items() if times > 1.0}
 
 

@@ -16,13 +16,14 @@ from graphloc.build import Problem, Stream
 from graphloc.config import VesselConfig
 from graphloc.frames import Array
 from graphloc.signals.position_jumps import LASTS_S, why_in_doubt
-from graphloc.solution import CONTRADICTING_COST, Cause, Health, HealthReason, SolveStats
+from graphloc.solution import CONTRADICTING_COST, LOST_BOUND_M, Cause, Health, HealthReason, SolveStats
 from graphloc.solve.batch import BatchResult
 from graphloc.solve.decide import AGREES, CREDIBLE, Verdict, far_sigmas
 from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE
+from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory, bounds_95
 
-_LOST_BOUND_M, _LOST_HEADING_DEG = 25.0, 45.0  # beyond them a pose helps nobody in a harbour
+_LOST_HEADING_DEG = 45.0  # 95 % bound beyond which a heading helps nobody
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
 
 FAR_OFF = 3.0
@@ -140,7 +141,7 @@ def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:
     known = np.flatnonzero(np.isfinite(since))
     if not len(known):
         return since
-    first = stamps_ns[known[0]] - int(since[known[0]] * 1e9)
+    first = stamps_ns[known[0]] - duration_ns(since[known[0]])
     return np.where(np.isfinite(since), since, (first - stamps_ns) * 1e-9)
 
 
@@ -172,8 +173,11 @@ def health_of(
     """
     bound_m, _, heading_deg = (float(v) for v in bounds_95(cov[None])[0])
     silent = [name for name, s in away_s.items() if s > _SILENT_S]
-    if bound_m > _LOST_BOUND_M or heading_deg > _LOST_HEADING_DEG:
+    if bound_m > LOST_BOUND_M:
         return Health.LOST, HealthReason(f"95 % bound {bound_m:.0f} m, heading {heading_deg:.0f} deg", Cause.BOUND)
+    if heading_deg > _LOST_HEADING_DEG:
+        said = f"heading unknown: 95 % bound {heading_deg:.0f} deg; that of the position {bound_m:.1f} m"
+        return Health.LOST, HealthReason(said, Cause.HEADING)
     if min(away_s.values(), default=np.inf) > _DEAD_RECKONING_S:
         return Health.DEAD_RECKONING, HealthReason("no absolute position agrees", Cause.NO_POSITION)
     if bound_m > good_bound_m:

@@ -20,7 +20,7 @@ from graphloc.solution import CONTRADICTING_COST, Graded, SolveStats
 from graphloc.solve._lasting import lasting
 from graphloc.solve._passes import expected_cost
 from graphloc.solve.batch import BatchResult
-from graphloc.solve.bias_walk import KEYS, WANDERS_S, too_steady, walk_times, wandered
+from graphloc.solve.bias_walk import WALK_KEYS, WANDERS_S, too_steady, walk_times, wandered
 from graphloc.solve.decide import AGREES, Verdict
 from graphloc.solve.health import FAR_OFF, late_of
 from graphloc.solve.imu_mount import MountError, mount_sigma_rad
@@ -33,7 +33,9 @@ _SMALL_M = 0.1  # a slow error below it is that of RTK
 _TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
 _BY_CHANCE = 1e-3  # anywhere in the run; a choice
 _UNAIDED_S = 30.0  # at an end of the run, from which the IMU alone is metres off
-_WANDERS = 4.0  # sigmas of its random walk over that: smoothed, a bias that walks so moves by less than two
+# Sigmas of its random walk over that: smoothed, a bias that walks so moves by less than two. More than the 3 from which `bias_walk` looks
+# closer: there a test of the whole run decides as well, and costs nothing where it denies; here the user is asked to act on this alone.
+_WANDERS_SAID = 4.0
 _LEVELS_M = 0.5  # sigma, for levels that may be the usual ones as well: said from there on
 
 
@@ -248,9 +250,9 @@ def _wandering_biases(problem: Problem, result: BatchResult) -> list[str]:
         return []
     every = wandered(problem, result.values)
     for times, what, key, bounds in zip(
-        every, ("accelerometers", "gyroscopes"), KEYS, ("roll, pitch and position", "the heading"), strict=True
+        every, ("accelerometers", "gyroscopes"), WALK_KEYS, ("roll, pitch and position", "the heading"), strict=True
     ):
-        if times > _WANDERS:
+        if times > _WANDERS_SAID:
             said = f"{problem.imu.sensor}: a bias of its {what} changes within {WANDERS_S:.0f} s by {times:.1f} sigmas of what {key} allows"
             cure = f"it warms up, or is a cheap one; set {key}: {float(f'{times * getattr(config, key):.2g}'):g} or more, until this line is gone: else the bounds of {bounds} are too small"
             warnings.append(Graded(f"{said}: {cure}", f"wandering {what}", float(times)))

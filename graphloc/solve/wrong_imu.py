@@ -24,9 +24,9 @@ from graphloc.recording import Recording
 from graphloc.solve._passes import cost_as_configured
 from graphloc.solve.decide import agrees, met
 from graphloc.solve.stretch import copy_states, dead_reckon
-from graphloc.time import NS_PER_S, utc_text
+from graphloc.time import NS_PER_S, duration_ns, utc_text
 
-WHY = "contradicts the other sensors, which agree with each other"
+WRONG_IMU = "contradicts the other sensors, which agree with each other"
 # Squares of an IMU factor that make it one; and how many times those of the window before.
 _SUSPECT, _TIMES = 36.0, 30.0
 _BEFORE_S = 2.5  # what is known before a window may be wrong already
@@ -54,8 +54,8 @@ def left_out(recording: Recording, spans: Sequence[tuple[int, int]]) -> tuple[Re
     for after_ns, until_ns in spans:
         wrong |= (imu.stamps_ns > after_ns) & (imu.stamps_ns <= until_ns)
     where = ", ".join(f"{(b - a) / NS_PER_S:.1f} s from {utc_text(a)}" for a, b in spans)
-    rows = (*recording.rows, *recording.imu_rows(wrong, Outcome.REJECTED, WHY))
-    said = f"{imu.sensor}: for {where} it {WHY}: {int(wrong.sum())} samples rejected, the motion there is bridged as in an IMU gap"
+    rows = (*recording.rows, *recording.imu_rows(wrong, Outcome.REJECTED, WRONG_IMU))
+    said = f"{imu.sensor}: for {where} it {WRONG_IMU}: {int(wrong.sum())} samples rejected, the motion there is bridged as in an IMU gap"
     return replace(recording, imu=imu.where(~wrong), rows=rows), said
 
 
@@ -99,7 +99,7 @@ def wrong_span(window: GrownWindow, before: gtsam.Values, solve: Callable[[Probl
         before: its states up to `known`, as solved without what is new. solve: solves the window of a problem, in place.
     """
     problem, values, first, known, last, _ = window
-    begin = max(first + 1, problem.timeline.floor(int(problem.timeline.stamps_ns[known] - _BEFORE_S * NS_PER_S)))
+    begin = max(first + 1, problem.timeline.floor(int(problem.timeline.stamps_ns[known]) - duration_ns(_BEFORE_S)))
     agreed, squares = _agreeing(problem, values, begin, last)
     if not _contradicted(problem, values, first, begin, last) and sum(map(_denies, agreed)) < _SENSORS:
         return None
