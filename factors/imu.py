@@ -43,6 +43,7 @@ from graphloc.time import duration_ns
 
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # white noise of unknown motion in a gap
 _SHORT_S = 2.0  # longest gap that is interpolated linearly; none is so short in which an IMU is switched off and on
+_STALLS_S = 10.0  # longest pause of all sensors that is taken for a recorder's and not for a power cycle; a choice
 _ANEW = 0.25  # of the turn-on bias, by which it differs from one time to the next; a choice
 _FORGET_S, _AROUND_S = 1.0, 10.0  # decay of the last sample in a gap; length of the means on either side
 _LAID_MPS = 3.0  # 1 sigma, of a vessel whose velocity is not known yet
@@ -68,18 +69,31 @@ class Links:
         gyro = config.gyro_noise_radps * noise_scale
         self._left_out: list[tuple[int, int]] = []
         self._pauses: list[tuple[int, int]] = []
-        self._silent = _silences(self._stamps)
+        self._silent = self._silences(self._stamps)
         self._params = self._make_params(self._gravity_mps2, config.accel_noise_mps2 * noise_scale, np.full(3, gyro))
 
     def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
         """Add samples (N, 6), specific force and rate, at new stamps, in any order."""
-        newest = self._stamps[-1:]
         stamps, rows = np.concatenate([self._stamps, stamps_ns]), np.concatenate([self._samples, samples])
         if (np.diff(stamps[-len(stamps_ns) - 1 :]) <= 0).any():
             order = np.argsort(stamps, kind="stable")
             stamps, rows = stamps[order], rows[order]
         self._stamps, self._samples = stamps, rows
-        self._silent += _silences(stamps[stamps >= newest[0]] if len(newest) else stamps)
+        # A late sample may end a silence that was found before.
+        again = stamps[max(int(np.searchsorted(stamps, stamps_ns.min())) - 1, 0) :]
+        self._silent = np.vstack([self._silent[self._silent[:, 1] <= again[0]], self._silences(again)])
+
+    def _silences(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return (S, 2) the stamps between which nothing came for longer than `_SHORT_S`."""
+        wide = np.flatnonzero(np.diff(stamps_ns) > _SHORT_S * 1e9)
+        return self._unexplained(np.column_stack([stamps_ns[wide], stamps_ns[wide + 1]]))
+
+    def _unexplained(self, silent: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the silences (S, 2) without those that consist of samples which were left out."""
+        silent_ns = silent[:, 1] - silent[:, 0]
+        for after_ns, until_ns in self._left_out:
+            silent_ns -= np.maximum(np.minimum(silent[:, 1], until_ns) - np.maximum(silent[:, 0], after_ns), 0)
+        return np.asarray(silent[silent_ns > _SHORT_S * 1e9])
 
     def leave_out(self, after_ns: int, until_ns: int) -> None:
         """Drop the samples after one stamp until another, which is then a gap, however short. The very first sample is not among them."""
@@ -87,10 +101,13 @@ class Links:
         self._stamps, self._samples = self._stamps[kept], self._samples[kept]
         within = [gap for gap in self._left_out if after_ns <= gap[0] and gap[1] <= until_ns]
         self._left_out = [gap for gap in self._left_out if gap not in within] + [(after_ns, until_ns)]
+        self._silent = self._unexplained(self._silent)
 
     def pause(self, after_ns: int, until_ns: int) -> None:
         """Add noise between two samples, as if less time or none had passed between them; that is then a gap, however short."""
         self._pauses.append((after_ns, until_ns))
+        if until_ns - after_ns < _STALLS_S * 1e9:
+            self._silent = self._silent[(self._silent != (after_ns, until_ns)).any(axis=1)]
 
     def forget(self, before_ns: int) -> None:
         """Drop the samples before a stamp, except the last of them and those that the bridge of a gap after it needs."""
@@ -309,14 +326,15 @@ class Links:
     def bias_steps(self, from_ns: int, to_ns: int) -> Array:
         """Return the sigmas (6,) of how far the bias goes from one stamp to another: m/s^2, rad/s.
 
-        By its random walk. Where nothing came for longer than `_SHORT_S` the IMU may have been off, or its driver have started it anew:
-        its turn-on bias is then another one. Not in a pause of all sensors, which the recorder makes.
+        By its random walk. Where nothing came for longer than `_SHORT_S` the IMU may have been off, or its driver may have started it
+        anew: its turn-on bias is then another one. Not where samples came and were left out, nor in a pause of all sensors of some
+        seconds, in which the recorder was slow.
         """
         c = self._config
         sigmas = np.array([c.accel_bias_walk_mps2] * 3 + [c.gyro_bias_walk_radps] * 3)
         walk = sigmas**2 * (to_ns - from_ns) * 1e-9 * self._noise_scale**2
-        silent = (gap for gap in self._silent if gap not in self._pauses)
-        share = sum(max(min(to_ns, stop) - max(from_ns, start), 0) / (stop - start) for start, stop in silent)
+        start, stop = self._silent.T
+        share = float((np.maximum(np.minimum(to_ns, stop) - np.maximum(from_ns, start), 0) / (stop - start)).sum())
         return np.sqrt(walk + share * (_ANEW * self.bias_sigmas()) ** 2)
 
     def bias_sigmas(self) -> Array:
@@ -329,12 +347,6 @@ class Links:
         wide = np.flatnonzero(np.diff(self._stamps) > self._max_gap_ns)
         found = {(int(self._stamps[i]), int(self._stamps[i + 1])) for i in wide}
         return sorted(found | {self._around(*gap) for gap in self._left_out} | set(self._pauses))
-
-
-def _silences(stamps_ns: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Return where nothing came for longer than `_SHORT_S`, (start, stop) in ns."""
-    wide = np.flatnonzero(np.diff(stamps_ns) > _SHORT_S * 1e9)
-    return [(int(stamps_ns[i]), int(stamps_ns[i + 1])) for i in wide]
 
 
 def _squared(v: Array) -> Array:

@@ -425,6 +425,7 @@ def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
         reported_accel_ug=reported(10, ug),
         reported_gyro_mdps=reported(11, mdps),
         mount=_mount_guess(samples, evidence),
+        fast=units.fast,
         missing=missing,
         unfinite=int((~finite).sum()),
     )
@@ -432,12 +433,13 @@ def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
 
 
 class _Units(NamedTuple):
-    """Units of accelerations and rates, whether gravity is in them, and the median acceleration, as `ImuReport` has them."""
+    """Units of accelerations and rates, whether gravity is in them, the median acceleration, and whether rates are fast, as `ImuReport` has them."""
 
     accel: str
     gyro: str
     gravity: str
     gravity_size: float
+    fast: bool
     why: tuple[str, ...]
 
 
@@ -484,9 +486,11 @@ def _units_of(imu: ImuSeries, beside: Mapping[str, Yaws]) -> _Units:
         why.append(f"median acceleration is {size:.2f}: neither m/s^2 nor g with gravity; check the sensor")
     if turns == "deg/s":
         why.append(f"it turns as {as_turns} in deg/s")
-    elif gyro_unit == "deg/s":
+    elif fast and turns:
+        why.append(f"median rate is {rate:.2f}, but it turns as {as_turns} in rad/s")
+    elif fast:
         why.append(f"median rate is {rate:.2f}: too much for rad/s, looks like deg/s")
-    return _Units(accel_unit, gyro_unit, gravity, size, tuple(why))
+    return _Units(accel_unit, gyro_unit, gravity, size, fast and gyro_unit == "rad/s", tuple(why))
 
 
 def _standstill(

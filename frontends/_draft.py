@@ -156,7 +156,7 @@ def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
         lines.append(f"  enabled: false  # guess: {why}")
     if imu.accel_unit != "m/s^2":
         lines.append(f"  accel_unit: {imu.accel_unit}  # guess: {reason}")
-    if imu.gyro_unit != "rad/s":
+    if imu.gyro_unit != "rad/s" or imu.fast:
         lines.append(f"  gyro_unit: {imu.gyro_unit}  # guess: {reason}")
     if imu.gravity != "included":
         lines.append(f"  gravity: {imu.gravity}  # guess: {reason}")

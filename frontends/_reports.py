@@ -128,6 +128,7 @@ class ImuReport:
         still_s: standstill found; gyro_bias_radps is from it (None without).
         accel_noise_ug, gyro_noise_mdps: noise densities, of the worst axis, at rest or in motion.
         reported_accel_ug, reported_gyro_mdps: densities that the messages' covariances amount to.
+        fast: whether its rates are in rad/s, by its turns, though by their size deg/s would be likelier.
         missing: 'rates' or 'accelerations' where all of these are 0: half an IMU, as some drivers publish it; else ''.
         unfinite: samples that hold NaN.
     """
@@ -146,6 +147,7 @@ class ImuReport:
     reported_accel_ug: float | None
     reported_gyro_mdps: float | None
     mount: MountGuess
+    fast: bool = False
     missing: str = ""
     unfinite: int = 0
 

@@ -121,9 +121,9 @@ def slow_warning(sensor: str, stamps_ns: NDArray[np.int64], config: ImuConfig) -
 
 
 def fast_warning(imu: ImuSeries, config: ImuConfig) -> list[str]:
-    """Return a line on rates in rad/s that are so fast throughout that deg/s are likelier, unless gravity turns as they say."""
+    """Return a line on rates that are so fast throughout that deg/s are likelier, where no unit is set, unless gravity turns as they say."""
     rate = float(np.median(np.linalg.norm(imu.gyro_radps, axis=1)))
-    fast = config.gyro_unit == "rad/s" and rate > NEVER_STILL_RADPS
+    fast = "gyro_unit" not in config.model_fields_set and rate > NEVER_STILL_RADPS
     if not fast or turns_gravity(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps):
         return []
     return [f"{imu.sensor}: median angular rate is {rate:.2f} rad/s: looks like deg/s; set gyro_unit: deg/s"]

@@ -229,6 +229,9 @@ def test_the_report_says_that_bounds_hang_on_the_guess_of_an_antenna(*, still: b
     said = [r for r in track.reasons if "hardly shows where the antenna of gnss sits" in r.text]
     assert [r.trust for r in said] == [Trust.WITH_CARE] * still
     assert all("within 0.98 m of mount.xyz_m" in r.text for r in said)
+    sure = data.config.sensors["gnss"].model_copy(update={"mount_sigma_m": 0.02})  # beside bounds of decimetres
+    (track,) = verdict(replace(data, config=data.config.with_sensors({"gnss": sure}))).tracks
+    assert not any("hardly shows" in r.text for r in track.reasons)
 
 
 def test_a_vessel_that_lies_still_is_no_surer_of_its_place_after_restarts(tmp_path: Path) -> None:

@@ -88,8 +88,9 @@ def test_the_new_sensor_is_as_ours_are(monkeypatch: pytest.MonkeyPatch) -> None:
     config = beacon.RangeBeaconConfig(beacon_m=(90.0, -70.0, 12.0))
     at = attachment(beacon.ROW, config)
     m = beacon.ROW.ideal(at, config)
-    antenna = np.asarray(at.T_world_body.matrix()) @ np.array([-1.5, 0.4, 2.2, 1.0])
-    assert m.range_m == pytest.approx(float(np.linalg.norm(antenna[:3] - [90.0, -70.0, 12.0])))
+    at_state = np.asarray(at.T_world_body.matrix()) @ np.array([-1.5, 0.4, 2.2, 1.0])
+    antenna = at_state[:3] + np.array([0.3, -0.2, 0.05])  # the way since the state
+    assert m.range_m == pytest.approx(float(np.linalg.norm(antenna - [90.0, -70.0, 12.0])))
     (factor,) = factors_of(beacon.ROW, m, config, at, Decision()).factors
     assert factor.error(values_of(at, ())) < 1e-12
     (residual,) = beacon.ROW.residuals(m, config, at)

@@ -263,3 +263,27 @@ def test_after_a_silence_the_biases_may_be_others(silent_s: float) -> None:
         assert variance(link, 9.0, 11.0) + variance(link, 11.0, 14.0) == pytest.approx(expected, rel=1e-6)
     links.pause(10 * S, int((10.0 + silent_s) * S))  # of all sensors: the recorder's
     assert variance(links, 9.0, 14.0) == pytest.approx(walk, rel=1e-6)
+
+
+def test_only_a_silence_makes_other_biases() -> None:
+    """Not samples that came and were left out, nor late ones; a pause of all sensors for as long as a power cycle takes does."""
+    still = np.zeros((40 * RATE_HZ, 3))
+    whole = imu_of(still, np.tile([0.0, 0.0, G], (len(still), 1)), (0.0, 0.0), UPRIGHT)
+    rows = np.hstack([whole.accel_mps2, whole.gyro_radps])
+    missing = (whole.stamps_ns > 10 * S) & (whole.stamps_ns < 30 * S)
+
+    def gone(link: InertialLink) -> float:
+        return float(link.bias_steps(9 * S, 31 * S)[5] / link.bias_steps(9 * S, 10 * S)[5])
+
+    late, silent, thinned = (ROW.link(whole.where(~missing), ImuConfig(), UPRIGHT, G) for _ in range(3))
+    only_walk, another = gone(ROW.link(whole, ImuConfig(), UPRIGHT, G)), gone(silent)
+    assert only_walk == pytest.approx(np.sqrt(22.0))
+    assert another > 10.0 * only_walk
+    late.extend(whole.stamps_ns[missing], rows[missing])
+    thinned.leave_out(10 * S, 30 * S - 1)  # as where a window is rebuilt without them
+    out = ROW.link(whole.where(whole.stamps_ns < 30 * S), ImuConfig(), UPRIGHT, G)
+    out.leave_out(10 * S, 30 * S - 1)
+    out.extend(whole.stamps_ns[whole.stamps_ns >= 30 * S], rows[whole.stamps_ns >= 30 * S])
+    assert [gone(link) for link in (late, thinned, out)] == pytest.approx([only_walk] * 3)
+    silent.pause(10 * S, 30 * S)
+    assert gone(silent) == pytest.approx(another)

@@ -1121,8 +1121,17 @@ def test_the_unit_of_a_robot_that_pivots_is_told_by_its_attitude(scale: float, t
             items.append((topic, at, make.fix(at, 57.7, 11.9, 40.0)))
         elif topic == "/wheel/odom" and told_by == "odometry":
             items.append((topic, at, make.odometry(at, (0, 0, 0), spun)))
-    found, _, _ = look(tmp_path, items, make)
+    found, config, _ = look(tmp_path, items, make)
     assert found.imus[0].gyro_unit == ("rad/s" if scale == 1.0 else "deg/s")
+    assert not [w for w in read_recording(tmp_path / "run", config).warnings if "looks like deg/s" in w]
+    silent = config.sensors["imu"].model_copy(update={"gyro_unit": "rad/s"})
+    silent.__pydantic_fields_set__.discard("gyro_unit")
+    warned = (
+        read_recording(tmp_path / "run", config.with_sensors({"imu": silent})).warnings
+        if scale == 1.0
+        else ("looks like deg/s",)
+    )
+    assert any("looks like deg/s" in w for w in warned)
 
 
 @pytest.mark.parametrize("every", [1, 50])

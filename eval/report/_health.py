@@ -83,7 +83,7 @@ def cure(health: Health, reason: HealthReason) -> str:
     if reason.cause is Cause.GUESSED_HEADING:
         return "a heading sensor (compass, dual antenna), wheels or a log (body_velocity), or start.heading_deg"
     if reason.cause is Cause.HEADING:
-        return "a compass, wheels or a log (body_velocity), or turns and changes of speed"
+        return "a compass, wheels or a log (body_velocity), or, while fixes, matches or tags agree, turns and changes of speed"
     if health in (Health.LOST, Health.DEAD_RECKONING):
         return "a fix, match or tag that agrees"
     if reason.cause is Cause.SENSORS:

@@ -36,6 +36,7 @@ _TOO_SURE = 4.0  # NEES: errors are 1.4 times what the covariance says
 _HOLDS_OFFLINE = 0.9
 _PLACES = ("gnss", "pose", "aerial")
 _BESIDE_GNSS, _FEWEST_USED = ("pose", "aerial", "apriltag"), 10
+_GUESS = 0.25  # of a bound, above which a guess (95 %) makes a part of it that matters; a choice
 # Of a receiver from the track, for half of its fixes or more.
 _APART_M = 20.0  # farther than any multipath that lasts
 _APART_SIGMAS = 5.0  # of its slow error, where that is configured larger
@@ -266,7 +267,7 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
         if block.mount_sigma_m == 0.0:
             yield from _lever(data, name, bound_m)
         elif not solution.stats.online:  # it is estimated, and in the bounds as far as the guess holds
-            yield from _lever_not_shown(data, name, block.mount_sigma_m)
+            yield from _lever_not_shown(data, name, block.mount_sigma_m, bound_m)
         else:
             yield Reason(
                 trust=Trust.WITH_CARE,
@@ -275,11 +276,15 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
             )
 
 
-def _lever_not_shown(data: ReportData, name: str, guessed_m: float) -> Iterator[Reason]:
-    """Yield an antenna whose place the run tells less well than it was guessed (1 sigma of an axis): the bounds are as good as that guess."""
+def _lever_not_shown(data: ReportData, name: str, guessed_m: float, bound_m: float) -> Iterator[Reason]:
+    """Yield an antenna whose place the run tells less well than it was guessed: the bounds are as good as that guess.
+
+    Args:
+        guessed_m: 1 sigma of an axis. bound_m: of the position, 95 %, median; a guess that is small beside it does not matter.
+    """
     checks = data.calibration.checks if data.calibration else ()
     known_m = [c.sigma for c in checks if c.key in _level_keys(name)]
-    if known_m and max(known_m) > guessed_m:
+    if known_m and max(known_m) > guessed_m and SIGMAS_95 * guessed_m > _GUESS * bound_m:
         yield Reason(
             trust=Trust.WITH_CARE,
             text=f"This run hardly shows where the antenna of {name} sits (to {SIGMAS_95 * max(known_m):.2g} m, 95 %): its bounds hold if that is "

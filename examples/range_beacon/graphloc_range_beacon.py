@@ -42,7 +42,7 @@ class RangeBeaconConfig(SensorConfig):
 
 
 def _range_and_direction(at: Attachment, config: RangeBeaconConfig) -> tuple[float, Array]:
-    away = np.asarray(at.T_world_body.transformFrom(at.T_state_sensor.translation())) - np.array(config.beacon_m)
+    away = at.sensor_m() - np.array(config.beacon_m)
     range_m = float(np.linalg.norm(away))
     return range_m, away / range_m
 
