@@ -42,7 +42,8 @@ from graphloc.signals.series import integral, interpolated
 from graphloc.time import duration_ns
 
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # white noise of unknown motion in a gap
-_SHORT_S = 2.0  # longest gap that is interpolated linearly
+_SHORT_S = 2.0  # longest gap that is interpolated linearly; none is so short in which an IMU is switched off and on
+_ANEW = 0.25  # of the turn-on bias, by which it differs from one time to the next; a choice
 _FORGET_S, _AROUND_S = 1.0, 10.0  # decay of the last sample in a gap; length of the means on either side
 _LAID_MPS = 3.0  # 1 sigma, of a vessel whose velocity is not known yet
 _ASKEW_RAD = 0.1  # 1 sigma, of the direction of a motion across a pause
@@ -67,15 +68,18 @@ class Links:
         gyro = config.gyro_noise_radps * noise_scale
         self._left_out: list[tuple[int, int]] = []
         self._pauses: list[tuple[int, int]] = []
+        self._silent = _silences(self._stamps)
         self._params = self._make_params(self._gravity_mps2, config.accel_noise_mps2 * noise_scale, np.full(3, gyro))
 
     def extend(self, stamps_ns: NDArray[np.int64], samples: Array) -> None:
         """Add samples (N, 6), specific force and rate, at new stamps, in any order."""
+        newest = self._stamps[-1:]
         stamps, rows = np.concatenate([self._stamps, stamps_ns]), np.concatenate([self._samples, samples])
         if (np.diff(stamps[-len(stamps_ns) - 1 :]) <= 0).any():
             order = np.argsort(stamps, kind="stable")
             stamps, rows = stamps[order], rows[order]
         self._stamps, self._samples = stamps, rows
+        self._silent += _silences(stamps[stamps >= newest[0]] if len(newest) else stamps)
 
     def leave_out(self, after_ns: int, until_ns: int) -> None:
         """Drop the samples after one stamp until another, which is then a gap, however short. The very first sample is not among them."""
@@ -302,11 +306,18 @@ class Links:
         """Gravity (3,) in world where it is felt."""
         return np.array([0.0, 0.0, -self._gravity_mps2])
 
-    def bias_steps(self, dt_s: float) -> Array:
-        """Return the sigmas (6,) of the bias's random walk over `dt_s`: m/s^2, rad/s."""
+    def bias_steps(self, from_ns: int, to_ns: int) -> Array:
+        """Return the sigmas (6,) of how far the bias goes from one stamp to another: m/s^2, rad/s.
+
+        By its random walk. Where nothing came for longer than `_SHORT_S` the IMU may have been off, or its driver have started it anew:
+        its turn-on bias is then another one. Not in a pause of all sensors, which the recorder makes.
+        """
         c = self._config
         sigmas = np.array([c.accel_bias_walk_mps2] * 3 + [c.gyro_bias_walk_radps] * 3)
-        return np.asarray(sigmas * np.sqrt(dt_s) * self._noise_scale)
+        walk = sigmas**2 * (to_ns - from_ns) * 1e-9 * self._noise_scale**2
+        silent = (gap for gap in self._silent if gap not in self._pauses)
+        share = sum(max(min(to_ns, stop) - max(from_ns, start), 0) / (stop - start) for start, stop in silent)
+        return np.sqrt(walk + share * (_ANEW * self.bias_sigmas()) ** 2)
 
     def bias_sigmas(self) -> Array:
         """Return the turn-on sigmas (6,) of the bias: m/s^2, rad/s."""
@@ -318,6 +329,12 @@ class Links:
         wide = np.flatnonzero(np.diff(self._stamps) > self._max_gap_ns)
         found = {(int(self._stamps[i]), int(self._stamps[i + 1])) for i in wide}
         return sorted(found | {self._around(*gap) for gap in self._left_out} | set(self._pauses))
+
+
+def _silences(stamps_ns: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """Return where nothing came for longer than `_SHORT_S`, (start, stop) in ns."""
+    wide = np.flatnonzero(np.diff(stamps_ns) > _SHORT_S * 1e9)
+    return [(int(stamps_ns[i]), int(stamps_ns[i + 1])) for i in wide]
 
 
 def _squared(v: Array) -> Array:

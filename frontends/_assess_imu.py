@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from graphloc.config import STANDARD_GRAVITY_MPS2
+from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
 from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, wrap_angle
 from graphloc.frontends import _clock
 from graphloc.frontends._assess import Courses, MeasuredMotion, vec
@@ -24,11 +24,13 @@ from graphloc.frontends._sanity import (
     no_gravity_in_si,
     saturation_warning,
     size_at_ease,
+    slow_warning,
     turns_gravity,
     without_gravity,
 )
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import Pose, StaticTree
+from graphloc.frontends._turns import Yaws, unit_of_turns
 from graphloc.frontends.turning import Turning, course_against_turning, left_of_turns
 from graphloc.measurements import ImuSeries
 from graphloc.signals.frozen_imu import frozen_imu_warning, frozen_samples
@@ -75,11 +77,12 @@ class _Samples(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuEvidence:
-    """What an IMU is judged by: how the craft moved, by each source, the courses of the fixes, and tf."""
+    """What an IMU is judged by: how the craft moved, by each source, the courses of the fixes, tf, and the yaws that odometries and poses tell, by topic."""
 
     motions: Sequence[MeasuredMotion]
     courses: Courses | None
     tree: StaticTree
+    yaws: Mapping[str, Yaws] = field(default_factory=dict)
 
     def pose_of(self, frame: str | None) -> Pose | None:
         """Return T_body_frame by tf; None where it does not know the frame."""
@@ -381,7 +384,10 @@ def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
     stamps = imu.stamps_ns[keep]
     accel, gyro = np.where(finite[:, None], rows[:, :3], 0.0), np.where(finite[:, None], rows[:, 3:6], 0.0)
     missing = missing_half(accel, gyro)
-    units = _units_of(stamps, accel, gyro)
+    units = _units_of(
+        ImuSeries(sensor=imu.topic, stamps_ns=stamps, accel_mps2=accel, gyro_radps=gyro, seqs=np.arange(len(stamps))),
+        _yaws_beside(stamps, rows[:, 6:10], evidence),
+    )
     accel = accel * (STANDARD_GRAVITY_MPS2 if units.accel == "g" else 1.0)
     gyro = gyro * (np.pi / 180.0 if units.gyro == "deg/s" else 1.0)
     spiked = spike_warning(imu.topic, stamps, spikes(stamps, np.hstack([accel, gyro])))
@@ -404,7 +410,14 @@ def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
         accel_unit=units.accel,
         gyro_unit=units.gyro,
         gravity=units.gravity,
-        why=(*frozen, *spiked, *cut, *([f"all its {missing} are 0: {HALF}"] if missing else []), *units.why),
+        why=(
+            *frozen,
+            *slow_warning(imu.topic, stamps, ImuConfig()),
+            *spiked,
+            *cut,
+            *([f"all its {missing} are 0: {HALF}"] if missing else []),
+            *units.why,
+        ),
         still_s=float(still.sum()) * root_dt**2,
         gyro_bias_radps=vec(gyro[still].mean(axis=0)) if quiet else None,
         accel_noise_ug=float(white_noise(accel).max()) * root_dt / ug,
@@ -428,13 +441,40 @@ class _Units(NamedTuple):
     why: tuple[str, ...]
 
 
-def _units_of(stamps: NDArray[np.int64], accel: Array, gyro: Array) -> _Units:
-    """Return the likely units of accelerations (N, 3) and rates (N, 3), at stamps (N,) ns."""
+def _yaws_beside(stamps: NDArray[np.int64], orientation: Array, evidence: ImuEvidence) -> dict[str, Yaws]:
+    """Return what turns with an IMU, by what it does: its own orientation (N, 4), at stamps (N,), where it has one; odometries and poses; courses."""
+    own = yaws_of(stamps, orientation)
+    found = {"its own orientation does": own} if own else {}
+    found |= {f"the poses of {topic} do": yaws for topic, yaws in evidence.yaws.items()}
+    if (courses := evidence.courses) is not None:
+        found["the courses of the fixes do"] = courses.stamps_ns, courses.course_rad
+    return found
+
+
+def yaws_of(stamps: NDArray[np.int64], quaternions: Array) -> Yaws | None:
+    """Return the stamps and yaws of attitudes (N, 4), at stamps (N,); None where half of them are none."""
+    whole = np.isfinite(quaternions).all(axis=1) & (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) < 0.1)
+    if not len(whole) or whole.mean() <= 0.5:
+        return None
+    x, y, z, w = quaternions[whole].T
+    return stamps[whole], np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def _units_of(imu: ImuSeries, beside: Mapping[str, Yaws]) -> _Units:
+    """Return the likely units of samples as they are told: of rates by how they turn beside what turns with them; where that is not clear, by their size.
+
+    Where gravity does not turn either, as of a robot that pivots, size alone takes rad/s for deg/s.
+    """
+    stamps, accel, gyro = imu.stamps_ns, imu.accel_mps2, imu.gyro_radps
     size, at_ease = size_at_ease(accel, gyro)
     rate = float(np.median(np.linalg.norm(gyro, axis=1)))
     gravity = "removed" if without_gravity(accel) else "included"
     accel_unit = "g" if gravity == "included" and 0.9 < size < 1.1 else "m/s^2"
-    gyro_unit = "deg/s" if rate > NEVER_STILL_RADPS and not turns_gravity(stamps, accel, gyro) else "rad/s"
+    si = replace(imu, accel_mps2=accel * (STANDARD_GRAVITY_MPS2 if accel_unit == "g" else 1.0))
+    told = ((unit, by) for by, yaws in beside.items() if (unit := unit_of_turns(si, yaws)))
+    turns, as_turns = next(told, (None, ""))
+    fast = rate > NEVER_STILL_RADPS and not turns_gravity(stamps, accel, gyro)
+    gyro_unit = turns or ("deg/s" if fast else "rad/s")
     why = []
     if accel_unit == "g":
         why.append(f"median acceleration is {size:.2f}: looks like g")
@@ -442,7 +482,9 @@ def _units_of(stamps: NDArray[np.int64], accel: Array, gyro: Array) -> _Units:
         why.append(f"median acceleration is {size:.2f}: looks like gravity was removed by the driver")
     if accel_unit == "m/s^2" and gravity == "included" and no_gravity_in_si(size, at_ease):
         why.append(f"median acceleration is {size:.2f}: neither m/s^2 nor g with gravity; check the sensor")
-    if gyro_unit == "deg/s":
+    if turns == "deg/s":
+        why.append(f"it turns as {as_turns} in deg/s")
+    elif gyro_unit == "deg/s":
         why.append(f"median rate is {rate:.2f}: too much for rad/s, looks like deg/s")
     return _Units(accel_unit, gyro_unit, gravity, size, tuple(why))
 

@@ -235,6 +235,14 @@ def behind_s(own: Clock, imu: Clock, reference: Clock) -> float:
     return (imu if same else own).latency_s - reference.latency_s
 
 
+def most_early_s(own_s: float, imu_s: float) -> float:
+    """Return how much later than it is stamped a message can have been measured, s, by the times from stamps to recording of it and of an IMU.
+
+    Not after it was recorded, however it was stamped: on the clock of the IMU, whose samples may be stamped as late as fixes are.
+    """
+    return max(own_s - imu_s, 0.0) + MOST_ON_ITS_WAY_S
+
+
 class ScanClock(NamedTuple):
     """How far a LiDAR's stamps are ahead of the IMU's by the recording times, s: less than it by as much as its scans took longer to come."""
 

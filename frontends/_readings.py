@@ -205,9 +205,8 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     _sanity.refuse_half(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     _sanity.refuse_degrees(readings.sensor, series.stamps_ns, series.accel_mps2, series.gyro_radps, readings.config)
     _sanity.refuse_accel_unit(readings.sensor, series.accel_mps2, readings.config)
-    warnings += _sanity.imu_warnings(
-        readings.sensor, series.stamps_ns, series.accel_mps2, series.gyro_radps, readings.config
-    )
+    warnings += _sanity.slow_warning(readings.sensor, series.stamps_ns, readings.config)
+    warnings += _sanity.imu_warnings(readings.sensor, series.accel_mps2, series.gyro_radps, readings.config)
     return series, rows
 
 

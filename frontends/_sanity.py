@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum, Geodetic, continuous_longitudes
-from graphloc.measurements import GnssPosition, PoseFix
+from graphloc.measurements import GnssPosition, ImuSeries, PoseFix
+from graphloc.time import NS_PER_S
 
 FAR_M = 100e3
 """A fix this far from the middle of its run is not believed."""
@@ -93,14 +94,11 @@ def turns_gravity(stamps_ns: NDArray[np.int64], accel: Array, gyro_radps: Array)
     return not round_and_round and float(np.median(left)) < _EXPLAINED * float(np.median(moved))
 
 
-def imu_warnings(
-    sensor: str, stamps_ns: NDArray[np.int64], accel_mps2: Array, gyro_radps: Array, config: ImuConfig
-) -> list[str]:
-    """Return lines on units and gravity of accelerations (N, 3) and rates (N, 3), converted as configured."""
+def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuConfig) -> list[str]:
+    """Return lines on the unit, gravity and range of accelerations (N, 3) and rates (N, 3), converted as configured."""
     if len(accel_mps2) < 10:
         return []
     g, at_ease = size_at_ease(accel_mps2, gyro_radps)
-    rate = float(np.median(np.linalg.norm(gyro_radps, axis=1)))
     lines = []
     said = f"{sensor}: median acceleration is {g:.2f} m/s^2"
     if config.gravity != "removed" and no_gravity_in_si(g, at_ease):
@@ -110,10 +108,25 @@ def imu_warnings(
             lines.append(f"{said}, not about 9.8: check accel_unit, and the sensor itself")
     elif config.gravity == "removed" and g > 8.0:
         lines.append(f"{said}: looks like gravity is included; set gravity: included")
-    fast = config.gyro_unit == "rad/s" and rate > NEVER_STILL_RADPS
-    if fast and not turns_gravity(stamps_ns, accel_mps2, gyro_radps):
-        lines.append(f"{sensor}: median angular rate is {rate:.2f} rad/s: looks like deg/s; set gyro_unit: deg/s")
     return lines + saturation_warning(sensor, accel_mps2, gyro_radps)
+
+
+def slow_warning(sensor: str, stamps_ns: NDArray[np.int64], config: ImuConfig) -> list[str]:
+    """Return a line on an IMU whose samples, at stamps (N,), are so far apart that each interval is a gap, and the motion in it unknown."""
+    apart_s = float(np.median(np.diff(stamps_ns))) / NS_PER_S if len(stamps_ns) > 1 else 0.0
+    if apart_s <= config.max_gap_s:
+        return []
+    said = f"{sensor}: its samples come {apart_s:.1f} s apart, more than max_gap_s ({config.max_gap_s:g} s): each interval is a gap"
+    return [f"{said}, and nothing tells the motion in it; online it does not start: record the IMU at 50 Hz or more"]
+
+
+def fast_warning(imu: ImuSeries, config: ImuConfig) -> list[str]:
+    """Return a line on rates in rad/s that are so fast throughout that deg/s are likelier, unless gravity turns as they say."""
+    rate = float(np.median(np.linalg.norm(imu.gyro_radps, axis=1)))
+    fast = config.gyro_unit == "rad/s" and rate > NEVER_STILL_RADPS
+    if not fast or turns_gravity(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps):
+        return []
+    return [f"{imu.sensor}: median angular rate is {rate:.2f} rad/s: looks like deg/s; set gyro_unit: deg/s"]
 
 
 def saturation_warning(sensor: str, accel_mps2: Array, gyro_radps: Array) -> list[str]:

@@ -38,6 +38,7 @@ from graphloc.frontends.decode import (
     gps_fix_velocity_mps,
     nav_sat_status,
     nmea_sigmas_m,
+    no_lock,
     pose_numbers,
     stamp_ns_of,
 )
@@ -51,6 +52,11 @@ Row = tuple[float, ...]
 
 def _xyz(v: Any) -> tuple[float, float, float]:
     return (v.x, v.y, v.z)
+
+
+def _velocity_row(v: Any) -> tuple[float, float, float]:
+    said = _xyz(v)
+    return (np.nan, np.nan, np.nan) if no_lock(said) else said
 
 
 def _xyzw(q: Any) -> tuple[float, float, float, float]:
@@ -82,9 +88,9 @@ ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
     QUATERNION: lambda m: _xyzw(m.quaternion),
     ODOMETRY: _odometry_row,
     **dict.fromkeys(PLACES, _pose_row),
-    TWIST: lambda m: _xyz(m.twist.twist.linear),
-    PLAIN_TWIST: lambda m: _xyz(m.twist.linear),
-    VECTOR: lambda m: _xyz(m.vector),
+    TWIST: lambda m: _velocity_row(m.twist.twist.linear),
+    PLAIN_TWIST: lambda m: _velocity_row(m.twist.linear),
+    VECTOR: lambda m: _velocity_row(m.vector),
     **dict.fromkeys(GPS_FIXES, _fix_row),
     **dict.fromkeys(NUMBERS, lambda m: (m.data,)),
 }

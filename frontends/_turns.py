@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +106,7 @@ def without_line(values: Array, at_s: Array, *columns: Array) -> Array:
     return np.asarray(values - line @ np.linalg.lstsq(line, values, rcond=None)[0])
 
 
-def refuse_unit(imu: ImuSeries, config: ImuConfig, yaws_by_source: Mapping[str, Yaws]) -> None:
+def refuse_unit(imu: ImuSeries, config: ImuConfig, yaws_by_source: Mapping[str, Yaws]) -> bool:
     """Refuse rates in another unit than configured: they turn by 57 times too little or too much, compared with headings.
 
     The solver would take the missing part of a turn for a bias, and the heading for known.
@@ -113,18 +114,36 @@ def refuse_unit(imu: ImuSeries, config: ImuConfig, yaws_by_source: Mapping[str, 
     Args:
         yaws_by_source: headings or courses, by their name in the message.
 
+    Returns:
+        Whether rates turn as some of these do, as configured.
+
     Raises:
         InputError: they are.
     """
     wrong, right = ("less", "rad/s") if config.gyro_unit == "deg/s" else ("more", "deg/s")
+    other = np.degrees(1.0) if wrong == "less" else np.radians(1.0)
+    fits = False
     for source, yaws in yaws_by_source.items():
         times = _times_turned(imu, yaws)
-        off = times * np.radians(1.0) if wrong == "less" else times / np.radians(1.0)
-        if 1.0 / _UNIT < off < _UNIT:
+        fits |= _alike(times, 1.0)
+        if _alike(times, other):
             raise InputError(
                 f"{imu.sensor}: its gyro turns {max(times, 1.0 / times):.0f} times {wrong} than {source}, in step with them: "
                 f"angular_velocity of {config.topic} is in {right}; set gyro_unit: {right} of sensors.{imu.sensor}"
             )
+    return fits
+
+
+def unit_of_turns(imu: ImuSeries, yaws: Yaws) -> Literal["rad/s", "deg/s"] | None:
+    """Return the unit in which rates turn as headings or courses do; None where these tell neither."""
+    times = _times_turned(imu, yaws)
+    if _alike(times, 1.0):
+        return "rad/s"
+    return "deg/s" if _alike(times, np.radians(1.0)) else None
+
+
+def _alike(times: float, expected: float) -> bool:
+    return bool(expected / _UNIT < times < expected * _UNIT)
 
 
 def scale_warning(imu: ImuSeries, sensor: str, yaws: Yaws) -> list[str]:

@@ -46,7 +46,7 @@ from graphloc.frontends._readings import (
     thin,
 )
 from graphloc.frontends._references import Reference, check_speed, true_trajectory
-from graphloc.frontends._sanity import lever_warning
+from graphloc.frontends._sanity import fast_warning, lever_warning
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import Yaws, pose_turn_warning, refuse_unit, scale_warning, turn_warnings, wander_warning
 from graphloc.frontends.decode import (
@@ -119,7 +119,7 @@ def read_recording(bags: Bags | Bag, config: VesselConfig, progress: Progress | 
     rows += dropped
     motions = _motions_of_fixes(sensors)
     if imu is not None:
-        _refuse_unit(imu, sensors)
+        warnings += _unit_warnings(imu, sensors)
         warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, [*motions.values()], mounts, config)
     warnings += _silent(sensors, rows, topics, config) + _unstamped(sensors, topics) + _heightless(sensors, config)
     warnings += _along_fewer(sensors) + exchanged_warnings(sensors, motions)
@@ -306,7 +306,8 @@ def _far_levers(config: VesselConfig, mounts: Mounts) -> list[str]:
     ]
 
 
-def _refuse_unit(imu: ImuSeries, sensors: Sequence[Readings]) -> None:
+def _unit_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
+    """Refuse rates whose turns are another unit's; return a line on those that are too fast, where no turns say that they are right."""
     (config,) = (r.config for r in sensors if r.sensor == imu.sensor and isinstance(r.config, ImuConfig))
     yaws: dict[str, Yaws] = {}
     for readings in sensors:
@@ -316,7 +317,7 @@ def _refuse_unit(imu: ImuSeries, sensors: Sequence[Readings]) -> None:
         elif fixes:
             courses = courses_of_fixes(fixes)
             yaws[f"the courses of {readings.sensor}"] = courses.stamps_ns, courses.course_rad
-    refuse_unit(imu, config, yaws)
+    return [] if refuse_unit(imu, config, yaws) else fast_warning(imu, config)
 
 
 def _yaws_of(readings: Readings) -> Yaws | None:

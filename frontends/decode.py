@@ -82,6 +82,8 @@ _NO_CLIMB_MPS2 = 1e6  # variance of a vertical velocity that is not told, m^2/s^
 # Beyond these no sensor of a vessel measures; they are finite, and a sum or a square of them need not be.
 _MOST_INERTIAL = 1e4  # in the unit of the bag: 1000 g; 30 turns a second in deg/s
 MOST_SPEED_MPS, MOST_DISTANCE_M, _MOST_HEIGHT_M = 1e4, 1e7, 1e5
+NO_LOCK_MPS = 32.768
+"""The least integer of 16 bits, in mm/s, less its sign."""
 _VARIANCES = (1e-18, 1e12)  # m^2 and the like: 1 nm to 1000 km
 
 
@@ -438,7 +440,16 @@ def _no_velocity(value: Array) -> Rejection | None:
         return malformed("velocity is NaN")
     if np.abs(value).max() > MOST_SPEED_MPS:
         return malformed(f"velocity is beyond {MOST_SPEED_MPS:g} m/s")
+    if no_lock(value):
+        return rejected(f"it has no lock: a Doppler log's {NO_LOCK_MPS:g} m/s say so")
     return None
+
+
+def no_lock(value: ArrayLike) -> bool:
+    """Return whether a velocity holds what Doppler logs write where they hear no echo."""
+    return bool(
+        (np.abs(np.abs(value) - NO_LOCK_MPS) < 1e-5).any()
+    )  # of float32, and of either sign once axes are turned
 
 
 def _body_velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:

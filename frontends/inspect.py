@@ -29,6 +29,7 @@ from graphloc.frontends._assess_imu import (
     inertial_of,
     turned_as_headed,
     turned_as_its_heading,
+    yaws_of,
 )
 from graphloc.frontends._assess_receivers import TWO_CRAFT_M, apart_warning
 from graphloc.frontends._assess_velocity import motion_of_poses, motions_of, odometry_report, velocity_report
@@ -69,7 +70,7 @@ from graphloc.frontends._unused import (
 from graphloc.frontends.decode import FIX_TYPES, IMU, PLAIN_TWIST, POSE_TYPES, TWIST, VECTOR
 from graphloc.frontends.part import Bags
 from graphloc.frontends.source import Bag
-from graphloc.frontends.time_offsets import motion_time_offset
+from graphloc.frontends.time_offsets import motion_time_offsets
 from graphloc.signals.frozen_receiver import frozen_fixes
 from graphloc.signals.white_noise import white_noise
 
@@ -115,7 +116,8 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     velocities = _velocity_reports(bag, reference)
     motions = _motions(bag, reference, odometry, velocities)
     courses = courses_of(reference) if len(reference.stamps_ns) else None
-    evidence = ImuEvidence(motions, courses, bag.tree)
+    posed = {s.topic: yaws for s in bag.of_type(*POSE_TYPES) if (yaws := yaws_of(s.stamps_ns, s.rows[:, 3:7]))}
+    evidence = ImuEvidence(motions, courses, bag.tree, posed)
     imus, in_body = _in_axes_up(bag, gnss, _imu_reports(bag, evidence))
     best = _best_imu(bag, imus, evidence)
     compasses = compasses_of(bag, courses, best)
@@ -124,7 +126,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     if turned and turned[0] is not imus[0]:
         best = _best_imu(bag, turned, evidence)
     velocities = [(s, with_side(report, s, best.felt if best else None)) for s, report in velocities]
-    late = {motion.source: motion_time_offset(best.felt, motion) for motion in motions} if best else {}
+    late = motion_time_offsets(best.felt, bag.aligned[imus[0].topic], motions, bag.aligned) if best else {}
     timed = [timed_fixes(report, late, motions, velocities, bag.streams) for report in gnss]
     together = {receiver_of(report.topic): report.late_s for report in timed if report.late_s}
     if any(c.late_s is None and receiver_of(c.topic) in together for c in compasses):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,8 +13,15 @@ from scipy.special import stdtrit
 
 from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion
-from graphloc.frontends._clock import FARTHEST_LATE_S, MOST_LATE_S, MOST_ON_ITS_WAY_S
+from graphloc.frontends._clock import (
+    FARTHEST_LATE_S,
+    MOST_LATE_S,
+    MOST_ON_ITS_WAY_S,
+    most_early_s,
+    usual_latency_s,
+)
 from graphloc.frontends._mount_yaw import FEWEST, MOVES_M, STEP_S, Felt, bent, unbroken, windows_of
+from graphloc.frontends._streams import TopicData
 from graphloc.frontends._turns import without_line
 from graphloc.frontends.turning import Turning
 from graphloc.signals.series import integral
@@ -118,7 +125,28 @@ class MotionOffset(NamedTuple):
         return abs(beside[0]) < 0.5 * abs(self.value_s)
 
 
-def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | None:
+def motion_time_offsets(
+    felt: Felt, imu: TopicData, motions: Sequence[MeasuredMotion], streams: Mapping[str, TopicData]
+) -> dict[str, MotionOffset | None]:
+    """Return `motion_time_offset` by source: none so late that it would have been recorded before it was measured.
+
+    Args:
+        imu: whose accelerations are felt. streams: by topic, on one clock.
+    """
+    imu_s = usual_latency_s(imu.stamps_ns, imu.logs_ns)
+    # Where recording times were made of the stamps they tell nothing.
+    copied = not imu.recorded and np.array_equal(imu.stamps_ns, imu.logs_ns)
+
+    def most_s(motion: MeasuredMotion) -> float:
+        own = streams.get(motion.source)
+        if own is None or copied:
+            return FARTHEST_LATE_S
+        return most_early_s(usual_latency_s(own.stamps_ns, own.logs_ns), imu_s)
+
+    return {motion.source: motion_time_offset(felt, motion, most_s(motion)) for motion in motions}
+
+
+def motion_time_offset(felt: Felt, motion: MeasuredMotion, most_s: float = FARTHEST_LATE_S) -> MotionOffset | None:
     """Return by how much the stamps of a motion are off, by the accelerometer; None if that does not show it.
 
     Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. The course is the
@@ -129,12 +157,13 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion) -> MotionOffset | Non
 
     Args:
         felt: of an IMU in the axes of the vessel. motion: positions, or a velocity over ground.
+        most_s: more cannot be right, as what heels a craft, and is felt as an acceleration, may have it.
     """
     if motion.way_m is None:
         return None
     t, at = felt.t_s, felt.times_of(motion)
     # Where the right offset is farther than is looked, a lesser peak of the same motion takes its place, clearly.
-    lags = np.arange(-FARTHEST_LATE_S, FARTHEST_LATE_S + 0.5 * _APART_S, _APART_S)
+    lags = np.arange(-FARTHEST_LATE_S, min(most_s, FARTHEST_LATE_S) + 0.5 * _APART_S, _APART_S)
     lengths = list[_Windows]()
     for half_s in windows_of(motion):
         margin = half_s + FARTHEST_LATE_S

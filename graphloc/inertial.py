@@ -106,8 +106,11 @@ class InertialLink(Protocol):
         """Gravity (3,), world axes: added to a specific force it gives an acceleration. Zero where the driver has removed gravity."""
         ...
 
-    def bias_steps(self, dt_s: float) -> Array:
-        """Return the sigmas (6,) of the bias random walk over `dt_s`, accelerometer first."""
+    def bias_steps(self, from_ns: int, to_ns: int) -> Array:
+        """Return the sigmas (6,) of how far the bias goes from one stamp to another, accelerometer first.
+
+        By its random walk, and by another turn-on bias where the sensor may have been off in between.
+        """
         ...
 
     def bias_sigmas(self) -> Array:

@@ -207,7 +207,9 @@ def replay(
         if interrupted:
             raise KeyboardInterrupt
         lost = recording.lost(config.of_kind("imu"))
-        raise SolveError(f"{recording.source}: never started: still waiting for {waiting or 'IMU data'}{lost}")
+        raise SolveError(
+            f"{recording.source}: never started: still waiting for {waiting or 'IMU data'}{_apart(recording, config)}{lost}"
+        )
     recording = with_busy_warning(gathering.recording(), config)
     return _result(session, recording, config, interrupted=interrupted)
 
@@ -315,3 +317,12 @@ def _solution(estimates: Sequence[Estimate], smoother: OnlineSmoother, ledger: L
         antennas_off_m=smoother.antennas_off_m,
         stats=replace(stats, states=len(kept)),
     )
+
+
+def _apart(recording: Recording, config: VesselConfig) -> str:
+    """Return a clause on an IMU whose samples are so far apart that each interval is a gap; empty of any other."""
+    if recording.imu is None or len(recording.imu) < 2:
+        return ""
+    apart_s = float(np.median(np.diff(recording.imu.stamps_ns))) / NS_PER_S
+    most_s = config.of_kind("imu")[recording.imu.sensor].max_gap_s
+    return f", whose samples come {apart_s:.1f} s apart, more than max_gap_s ({most_s:g} s)" if apart_s > most_s else ""

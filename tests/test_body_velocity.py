@@ -104,6 +104,18 @@ def test_what_is_no_velocity_is_refused() -> None:
     assert "along x alone" in sideways.reason
 
 
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("said", [-32.768, float(np.float32(-32.768))])
+def test_a_doppler_log_that_hears_no_echo_is_rejected(said: float, axis: int) -> None:
+    """It writes the least integer of 16 bits, in mm/s; as a speed that drew a boat away, and `inspect` took it for no velocity of hers."""
+    v = np.array([1.0, 0.2, 0.0])
+    assert decode(MAKE.twist(START_NS, v.tolist()), configured(axes=["x", "y", "z"])).value.tolist() == v.tolist()
+    v[axis] = said
+    lost = decode(MAKE.twist(START_NS, v.tolist()), configured(axes=["x", "y", "z"]))
+    assert lost.outcome is Outcome.REJECTED
+    assert "no lock" in lost.reason
+
+
 def test_a_line_of_a_stream_says_the_same() -> None:
     config = parse_config({"sensors": {"dvl": {"kind": "body_velocity", "axes": ["x", "y"]}}}, KINDS, "test")
     line = {"type": "body_velocity", "stamp": "5", "v_mps": [1.0, -0.5, 9.0], "sigma_mps": [0.1, 0.2, 0.3]}

@@ -17,7 +17,7 @@ from graphloc.eval.simulate import Scenario
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.factors.imu import ROW
 from graphloc.frames import Array
-from graphloc.inertial import GapMotion
+from graphloc.inertial import GapMotion, InertialLink
 from graphloc.measurements import ImuSeries, Measurement
 from tests.faults import arrivals_of, feed, numbered
 from tests.slowly import simulate_slowly
@@ -240,3 +240,26 @@ def test_online_it_is_back_at_once_after_a_silence_of_everything() -> None:
     fed = feed(smoother(run), run, numbered(left))
     assert fed.recovered_s(over_ns) < 1.0
     assert not [event for event in fed.events if "restarts" in event or "rebuilt" in event]
+
+
+@pytest.mark.parametrize("silent_s", [1.5, 3.0])
+def test_after_a_silence_the_biases_may_be_others(silent_s: float) -> None:
+    """A quarter of what they are when it is switched on, 10 mg and 2 deg/s, beside their walk; as much in parts, and where samples come one by one."""
+    still = np.zeros((20 * RATE_HZ, 3))
+    whole = imu_of(still, np.tile([0.0, 0.0, G], (len(still), 1)), (10.0, 10.0 + silent_s), UPRIGHT)
+    links = ROW.link(whole, ImuConfig(), UPRIGHT, G)
+    grown = ROW.link(whole.where(slice(5 * RATE_HZ)), ImuConfig(), UPRIGHT, G)
+    for k in range(5 * RATE_HZ, len(whole)):
+        grown.extend(whole.stamps_ns[k : k + 1], np.hstack([whole.accel_mps2, whole.gyro_radps])[k : k + 1])
+
+    def variance(link: InertialLink, from_s: float, to_s: float) -> Array:
+        return link.bias_steps(int(from_s * S), int(to_s * S)) ** 2
+
+    walk = variance(links, 4.0, 9.0)
+    another = np.array([0.0025 * 9.80665] * 3 + [np.radians(0.5)] * 3) ** 2
+    expected = walk + another * (silent_s > 2.0)
+    for link in (links, grown):
+        assert variance(link, 9.0, 14.0) == pytest.approx(expected, rel=1e-6)
+        assert variance(link, 9.0, 11.0) + variance(link, 11.0, 14.0) == pytest.approx(expected, rel=1e-6)
+    links.pause(10 * S, int((10.0 + silent_s) * S))  # of all sensors: the recorder's
+    assert variance(links, 9.0, 14.0) == pytest.approx(walk, rel=1e-6)

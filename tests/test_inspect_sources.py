@@ -21,11 +21,12 @@ from graphloc.config import (
     load_config,
     parse_config,
 )
-from graphloc.errors import InputError
+from graphloc.errors import InputError, SolveError
 from graphloc.frames import Array
 from graphloc.frontends.inspect import Inspection, draft_config, render
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition
+from graphloc.replay import replay
 from tests.bagfactory import START_NS, Item, Messages, S
 from tests.heldbags import hold_bag, inspect_bag, read_recording
 from tests.makers import said
@@ -1082,6 +1083,67 @@ def test_two_antennas_athwart_that_are_silent_in_turns_are_a_compass_beside_a_co
     assert "often goes sideways, since it turns as the gyro does" in text
 
 
+@pytest.mark.parametrize("scale", [1.0, 180.0 / np.pi], ids=["rad/s", "deg/s"])
+def test_the_unit_of_a_robot_that_trots_is_told_by_its_turns(scale: float, tmp_path: Path) -> None:
+    """It swings twice a second at 0.5 rad/s, and each step shakes it: deg/s were drafted, and then refused, as it turned 54 times less than the courses."""
+    make, rng = Messages(2), np.random.default_rng(1)
+    items = drive(make, gyro_scale=scale, seconds=120)
+    for topic, at, m in items:
+        if topic == "/imu":
+            phase = 4.0 * np.pi * (at - START_NS) / S
+            m.angular_velocity.x += scale * 0.6 * np.sin(phase)
+            m.angular_velocity.y += scale * 0.6 * np.cos(phase)
+            for axis in "xyz":
+                setattr(m.linear_acceleration, axis, getattr(m.linear_acceleration, axis) + 4.0 * rng.normal())
+    _, config, text = look(tmp_path, items, make)
+    assert isinstance(config.sensors["imu"], ImuConfig)
+    assert config.sensors["imu"].gyro_unit == ("rad/s" if scale == 1.0 else "deg/s")
+    assert ("it turns as the courses of the fixes do in deg/s" in text) == (scale != 1.0)
+    assert not [w for w in read_recording(tmp_path / "run", config).warnings if "looks like deg/s" in w]
+
+
+@pytest.mark.parametrize("told_by", ["odometry", "itself"])
+@pytest.mark.parametrize("scale", [1.0, 180.0 / np.pi], ids=["rad/s", "deg/s"])
+def test_the_unit_of_a_robot_that_pivots_is_told_by_its_attitude(scale: float, told_by: str, tmp_path: Path) -> None:
+    """At 1.2 rad/s and level: gravity does not turn, and courses are no headings. deg/s were drafted, and the heading was 108 deg off."""
+    make, rate = Messages(2), 1.2
+    items = []
+    for topic, at, m in drive(make, gyro_scale=scale, seconds=60):
+        t = (at - START_NS) / S
+        yaw = 10.0 * (rate / 2.0) * np.sin(t / 5.0) + rate * t
+        spun = Rotation.from_euler("z", yaw).as_quat().tolist()
+        if topic == "/imu":
+            v = m.angular_velocity
+            own = (spun, np.zeros(9)) if told_by == "itself" else ()
+            gyro = (v.x, v.y, scale * (rate * np.cos(t / 5.0) + rate))
+            items.append((topic, at, make.imu(at, (0.0, 0.0, G), gyro, *own)))
+        elif topic == "/fix":
+            items.append((topic, at, make.fix(at, 57.7, 11.9, 40.0)))
+        elif topic == "/wheel/odom" and told_by == "odometry":
+            items.append((topic, at, make.odometry(at, (0, 0, 0), spun)))
+    found, _, _ = look(tmp_path, items, make)
+    assert found.imus[0].gyro_unit == ("rad/s" if scale == 1.0 else "deg/s")
+
+
+@pytest.mark.parametrize("every", [1, 50])
+def test_an_imu_that_is_too_slow_is_said(every: int, tmp_path: Path) -> None:
+    """A logger that keeps one message a second: offline the antenna was 31 m from its mount, online it waited for IMU data, with no word why."""
+    make = Messages(2)
+    plain = drive(make, seconds=60)
+    imu = [item for item in plain if item[0] == "/imu"][::every]
+    items = sorted([*imu, *(item for item in plain if item[0] != "/imu")], key=lambda item: item[1])
+    found, config, _ = look(tmp_path, items, make)
+    said = "its samples come 1.0 s apart, more than max_gap_s (0.5 s): each interval is a gap"
+    assert (said in render(found)) == (every == 50)
+    recording = read_recording(tmp_path / "run", config)
+    assert [said in w for w in recording.warnings if "apart" in w] == [True] * (every == 50)
+    if every == 50:
+        with pytest.raises(
+            SolveError, match=r"waiting for 5 s of IMU data, whose samples come 1\.0 s apart, more than"
+        ):
+            replay(recording, config)
+
+
 def stamped_late(make: Messages, late_s: float, *, seconds: int, noise_m: float) -> list[Item]:
     """A drive without wheels, whose fixes are stamped so much later than they were measured."""
     items = [
@@ -1107,6 +1169,16 @@ def test_fixes_that_are_stamped_late_get_an_offset(late_s: float, tmp_path: Path
     assert (config.sensors["gnss"].time_offset_s != 0.0) == (late_s != 0.0)
     assert isinstance(config.sensors["gnss"], GnssConfig)
     assert config.sensors["gnss"].stamp_sigma_s >= 0.05  # what is left is estimated with the run
+
+
+@pytest.mark.parametrize("stamped", [(), ("/imu", "/fix"), ("/imu",)], ids=["copied", "stamped", "as NMEA"])
+def test_fixes_are_not_measured_after_they_were_recorded(stamped: tuple[str, ...], tmp_path: Path) -> None:
+    """Of a sailing boat that tacked, what she felt as she heeled drafted +1.74 +- 0.12 s for sentences that came 0.14 s after they were measured."""
+    make = Messages(2)
+    items = stamped_late(make, -1.5, seconds=120, noise_m=0.05)
+    came = sorted(((topic, at + (topic in stamped) * S // 50, m) for topic, at, m in items), key=lambda item: item[1])
+    _, config, _ = look(tmp_path, came, make)
+    assert config.sensors["gnss"].time_offset_s == pytest.approx(0.0 if stamped else 1.5, abs=0.1)
 
 
 def in_a_hall(make: Messages, yaw_deg: float, of: Callable[[int, list[float], list[float]], Any]) -> list[Item]:

@@ -44,7 +44,7 @@ def said(likely: Any, *at_s: float, lag_s: float = 10.0) -> list[str]:
     noise = ImuNoise(adapt=True)
     noise.begin(SECOND)
     config = SimpleNamespace(sensors={"imu": SENSOR})
-    links = SimpleNamespace(bias_steps=lambda dt_s: np.full(6, 1e-5 * np.sqrt(dt_s)))
+    links = SimpleNamespace(bias_steps=lambda a, b: np.full(6, 1e-5 * np.sqrt((b - a) / SECOND)))
     lines = []
     for at in at_s:
         lag: Any = SimpleNamespace(
@@ -77,7 +77,10 @@ def test_a_window_of_which_nothing_can_be_told_stands(likely: Any) -> None:
 @pytest.mark.parametrize("doubtful", [False, True])
 def test_biases_tell_no_walk_while_the_heading_is_doubtful(*, doubtful: bool) -> None:
     """A heading that may be wrong bends them as well."""
-    noise, links = ImuNoise(adapt=True), SimpleNamespace(bias_steps=lambda dt_s: np.full(6, 1e-5 * np.sqrt(dt_s)))
+    noise, links = (
+        ImuNoise(adapt=True),
+        SimpleNamespace(bias_steps=lambda a, b: np.full(6, 1e-5 * np.sqrt((b - a) / SECOND))),
+    )
     problem = SimpleNamespace(config=SimpleNamespace(sensors={"imu": SENSOR}), links=links)
     lines = []
     for k in range(6):

@@ -265,7 +265,9 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
             continue  # the same antenna
         if block.mount_sigma_m == 0.0:
             yield from _lever(data, name, bound_m)
-        elif solution.stats.online:  # it is estimated; offline it is in the bounds
+        elif not solution.stats.online:  # it is estimated, and in the bounds as far as the guess holds
+            yield from _lever_not_shown(data, name, block.mount_sigma_m)
+        else:
             yield Reason(
                 trust=Trust.WITH_CARE,
                 text=f"Where the antenna of {name} sits is estimated (mount_sigma_m): while the vessel has hardly turned, the bounds of the "
@@ -273,10 +275,26 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
             )
 
 
+def _lever_not_shown(data: ReportData, name: str, guessed_m: float) -> Iterator[Reason]:
+    """Yield an antenna whose place the run tells less well than it was guessed (1 sigma of an axis): the bounds are as good as that guess."""
+    checks = data.calibration.checks if data.calibration else ()
+    known_m = [c.sigma for c in checks if c.key in _level_keys(name)]
+    if known_m and max(known_m) > guessed_m:
+        yield Reason(
+            trust=Trust.WITH_CARE,
+            text=f"This run hardly shows where the antenna of {name} sits (to {SIGMAS_95 * max(known_m):.2g} m, 95 %): its bounds hold if that is "
+            f"within {SIGMAS_95 * guessed_m:.2g} m of mount.xyz_m, as mount_sigma_m says; beyond, the track is off by as much. Measure it.",
+        )
+
+
+def _level_keys(name: str) -> list[str]:
+    return [f"sensors.{name}.mount.xyz_m[{axis}]" for axis in (0, 1)]
+
+
 def _lever(data: ReportData, name: str, bound_m: float) -> Iterator[Reason]:
     """Yield an antenna whose place is taken as configured, if that looks wrong or is the default; `bound_m`: of the position, 95 %, median."""
     suggestions, checks = (data.calibration.suggestions, data.calibration.checks) if data.calibration else ((), ())
-    keys = [f"sensors.{name}.mount.xyz_m[{axis}]" for axis in (0, 1)]
+    keys = _level_keys(name)
     off_m = math.hypot(*(s.suggested - s.configured for s in suggestions if s.key in keys))
     if off_m > 0.0:
         yield Reason(

@@ -45,9 +45,9 @@ _IN_BOUNDS = 1.5  # sigmas of a slow error that the bounds include: jumps up to 
 _CHAIN_END = 2.0  # variances of the process: the prior at either end of a chain
 
 
-def bias_step(links: InertialLink, j: int, dt_s: float) -> Any:
-    """Return the random walk factor of the bias from slow node `j` to the next."""
-    model = gtsam.noiseModel.Diagonal.Sigmas(links.bias_steps(dt_s))
+def bias_step(links: InertialLink, j: int, from_ns: int, to_ns: int) -> Any:
+    """Return the random walk factor of the bias from slow node `j`, at `from_ns`, to the next."""
+    model = gtsam.noiseModel.Diagonal.Sigmas(links.bias_steps(from_ns, to_ns))
     return gtsam.BetweenFactorConstantBias(keys.bias(j), keys.bias(j + 1), gtsam.imuBias.ConstantBias(), model)
 
 

@@ -156,7 +156,8 @@ def build_graph(
         graph.add(problem.inertial[k])
     nodes = nodes_of(problem, first, last)
     for j in nodes[:-1]:
-        graph.add(bias_step(problem.links, j, _node_dt_s(problem, j)))
+        from_ns, to_ns = problem.timeline.slow_stamps_ns[j : j + 2]
+        graph.add(bias_step(problem.links, j, int(from_ns), int(to_ns)))
     if problem.usual_motion is not None:
         for factor in problem.usual_motion.factors(problem.timeline, values, nodes, first):
             graph.add(factor)

@@ -111,7 +111,7 @@ def _steps(known: Sequence[KnownBias], links: InertialLink, axis: int) -> Iterat
     """Yield, from the last, by how much one bias went in steps that its walk rules: since when, and the square by what it should."""
     later = known[-1]
     for then in reversed(known[:-1]):
-        walk = links.bias_steps((later.stamp_ns - then.stamp_ns) * 1e-9)[axis] ** 2
+        walk = links.bias_steps(then.stamp_ns, later.stamp_ns)[axis] ** 2
         if walk > _CLEAR * max(then.variance[axis], later.variance[axis]):
             expected = then.variance[axis] + walk - later.variance[axis]
             yield then.stamp_ns, float((later.bias[axis] - then.bias[axis]) ** 2 / expected)

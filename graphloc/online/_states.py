@@ -166,9 +166,10 @@ class States:
         window.guess(keys.velocity(k + 1), np.asarray(there.velocity()), t)
         self._links[k] = window.add([links.factor(k, j, pim)])
         if following != j:
-            dt_s = (timeline.slow_stamps_ns[following] - timeline.slow_stamps_ns[j]) * 1e-9
+            from_ns, to_ns = int(timeline.slow_stamps_ns[j]), int(timeline.slow_stamps_ns[following])
+            dt_s = (to_ns - from_ns) * 1e-9
             window.guess(keys.bias(following), bias, t)
-            window.add([bias_step(links, j, dt_s)])
+            window.add([bias_step(links, j, from_ns, to_ns)])
             self._next_slow(j, dt_s, t)
             self._next_motion(j, dt_s)
         window.touch(keys.bias(following), t)

@@ -261,6 +261,6 @@ def _step(before: Newest, newest: Newest, links: InertialLink) -> tuple[Array, A
     F, Q = np.eye(15), np.zeros((15, 15))
     F[:9] = -to_there @ J[:, :15]
     Q[:9, :9] = to_there @ to_there.T
-    Q[9:, 9:] = np.diag(links.bias_steps((newest.stamp_ns - before.stamp_ns) * 1e-9) ** 2)
+    Q[9:, 9:] = np.diag(links.bias_steps(before.stamp_ns, newest.stamp_ns) ** 2)
     turn, back = in_world(there.pose()), in_world(before.pose)
     return turn @ F @ back.T, turn @ Q @ turn.T

@@ -8,6 +8,7 @@ track, its bounds are too small, and it seems to contradict the other sensors.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import gtsam
@@ -90,7 +91,11 @@ def wandered(problem: Problem, values: gtsam.Values) -> Array:
     if not len(begin):
         return np.zeros(2)
     bias = np.array([values.atConstantBias(keys.bias(j)).vector() for j in range(len(t_s))])
-    gone = np.abs(bias[later[begin]] - bias[begin]).max(axis=0) / problem.links.bias_steps(WANDERS_S)
+    stamps = problem.timeline.slow_stamps_ns.tolist()
+    steps = [problem.links.bias_steps(*step) ** 2 for step in pairwise(stamps)]
+    walk = np.vstack([np.zeros(6), np.cumsum(steps, axis=0)])
+    by_walk = np.sqrt(walk[later[begin]] - walk[begin])
+    gone = (np.abs(bias[later[begin]] - bias[begin]) / by_walk).max(axis=0)
     return np.asarray(gone.reshape(2, 3).max(axis=1))
 
 
@@ -126,7 +131,7 @@ def went_too_far(
 
 def _gone(then: KnownBias, now: KnownBias, links: InertialLink, k: int) -> Array:
     """Return (3, 3): squared change, P - P' and Q (see `went_too_far`) of each axis of one kind, `k`, of sensor."""
-    walk = links.bias_steps((now.stamp_ns - then.stamp_ns) * 1e-9) ** 2
+    walk = links.bias_steps(then.stamp_ns, now.stamp_ns) ** 2
     each = np.array([(now.bias - then.bias) ** 2, then.variance - now.variance, walk])
     return each[:, 3 * k : 3 * k + 3]
 
