@@ -34,15 +34,15 @@ _FAR = 2.0  # F in the prior of an axis that may stay far off: sigmas beyond whi
 # Times the sigma of a constant's prior: the sigma of its part whose weight never changes, and twice the widest that the
 # whole is made by re-weighting. A vessel of 100 m has its antenna 20 m from where 1 m (1 sigma) was drafted.
 _WIDEST = 60.0
-_NOTHING = 1e6  # sigmas: no information
-_NO_DRIFT = 100.0  # times the time constant
-_SILENT = 3.0  # times the usual time between measurements
-_SPACED_OVER_S = 4.0  # longer than gateways hold messages back
+_NOTHING = 1e6  # sigmas of a prior without information
+_NO_DRIFT = 100.0  # factor on the time constant of a process that hardly drifts
+_SILENT = 3.0  # usual times between measurements, from which a sensor is silent
+_SPACED_OVER_S = 4.0  # time over which the spacing is taken: longer than gateways hold messages back
 SPACED_BY = 40
 """Most measurements before one that tell how far apart they come (`spacing_s`): two seconds of the fastest that are
 used."""
-_IN_BOUNDS = 1.5  # sigmas of a slow error that the bounds include: jumps up to there need no word
-_CHAIN_END = 2.0  # variances of the process: the prior at either end of a chain
+_IN_BOUNDS = 1.5  # sigmas of a slow error: size up to which the bounds include a jump, so that it needs no warning
+_CHAIN_END = 2.0  # variance of the prior at either end of a chain, in variances of the process
 
 
 def bias_step(links: InertialLink, j: int, from_ns: int, to_ns: int) -> Any:
@@ -201,7 +201,7 @@ def spacing_s(stamps_ns: NDArray[np.int64]) -> Array:
     at = np.arange(len(stamps_ns))
     first = np.maximum(np.searchsorted(stamps_ns, stamps_ns - duration_ns(_SPACED_OVER_S)), at - SPACED_BY)
     mean_s = (stamps_ns - stamps_ns[first]) / NS_PER_S / np.maximum(at - first, 1)
-    return np.where(at > first, np.round(mean_s, 3), np.inf)  # rounded: many are then alike, and reckoned once
+    return np.where(at > first, np.round(mean_s, 3), np.inf)  # rounded: equal ones are computed once
 
 
 @lru_cache(maxsize=256)  # many measurements are equally far apart

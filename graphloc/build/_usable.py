@@ -83,7 +83,7 @@ def sorted_out(
             continue
         else:
             outside[m.sensor] += 1
-        if m.seq < 0:  # configuration, not a message
+        if m.seq < 0:  # made of the configuration, not a message
             outside[m.sensor] = 0
             continue
         rows.append(recording.row_of(m, outcome, reason))

@@ -10,7 +10,7 @@ from graphloc.frames import Array
 from graphloc.signals.series import robust_sigma
 from graphloc.signals.white_noise import white_noise_of_thirds
 
-_BLOCK = 1000  # samples
+_BLOCK = 1000  # samples in a block
 FEWEST = 2 * _BLOCK
 """Fewest samples that give the density with a sigma: two blocks. A tenth of them gives the density alone."""
 

@@ -131,7 +131,7 @@ def _wanders(
     known = [KnownBias(begin_ns, start.bias.vector(), np.diagonal(start.bias_cov))]
     try:
         known += [known_bias(problem, values, k, past) for k, past in before]
-    except np.linalg.LinAlgError:  # some data do not determine them
+    except np.linalg.LinAlgError:  # the data before one of the states do not determine them
         return None
     found = [w for n, now in enumerate(known) if (w := went_too_far(known[:n], now, problem.links)) is not None]
     return BiasWanders({WALK_KEYS[k]: times for k, times in found[-1:]}) if found else None

@@ -9,7 +9,7 @@ import gtsam
 
 from graphloc.errors import not_solved
 
-_ABSOLUTE_TOL = 1e-3  # nats of the cost: choices hang on whole ones; a choice
+_ABSOLUTE_TOL = 1e-3  # nats of the cost: decisions depend on whole ones; a choice
 _AS_PROMISED = 0.1  # share of the tolerance within which a step agrees with the linear model
 _HOPELESS = 1e6  # times the initial cost: full steps do not recover from there
 
@@ -52,7 +52,7 @@ def optimize(
         while used < max_iterations:
             linear = stepper.iterate()
             following, error, used = _of(stepper), float(stepper.error()), used + 1
-            if not error < _HOPELESS * (initial + 1.0):  # also where it is not a number
+            if not error < _HOPELESS * (initial + 1.0):  # also if it is NaN
                 break
             if error < lowest:
                 best, lowest = following, error

@@ -114,7 +114,7 @@ class Returns(NamedTuple):
             if len(far):
                 since_ns = stamps_ns[one.fixes] - one.outage_ns[1]
                 count = int(np.searchsorted(since_ns, _STILL * since_ns[far[-1]], side="right"))
-                # Where it is the IMU that is off, the track is off nearly till the next fix that is used.
+                # If the IMU is off instead, the track stays off nearly until the next fix that is used.
                 if since_ns[far[-1]] < _CONVERGED * since_ns[-1]:
                     found.append(Return(one.outage_ns, one.fixes[:count], float(off_m[far].max())))
         others = sum(

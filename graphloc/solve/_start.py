@@ -29,7 +29,8 @@ from graphloc.solve.decide import Stage, cost_of_noise, decisions, weigh
 from graphloc.solve.stretch import copy_states, dead_reckon, fill_slow, solve_stretch
 from graphloc.time import duration_ns
 
-# Starts that cost this much more (log-likelihood) are dropped; while several remain, the window grows.
+# Starts that cost this much more (log-likelihood) are dropped. While several remain, the window grows up to a length:
+# that where sensors tell the heading, or that where only the motion does.
 _COST_APART, _LONGEST_S, _LONGEST_UNTOLD_S = 8.0, 60.0, 600.0
 _STEP_NS = 15_000_000_000  # longest time that a candidate is dead-reckoned before it is solved again
 # From its start up to here, a candidate is solved as a whole at each step. Later steps take what is before them as

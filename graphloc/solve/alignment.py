@@ -25,7 +25,7 @@ from graphloc.graph import Hint, SlowProcess
 from graphloc.solve._standstill import Track, gyro_bias, samples_of, slope_of, standstill
 from graphloc.time import utc_text
 
-_USUAL_SPEED_MPS = 10.0  # 1 sigma, where the speed is unknown
+_USUAL_SPEED_MPS = 10.0  # 1 sigma of the speed, where it is unknown
 _CARRIED_RAD = np.radians(20.0)  # 1 sigma by gyro bias, from which a later heading tells nothing of the start
 _OWN_TILT_RAD = 0.5  # 1 sigma of roll and pitch, without accelerometer data
 # Travel from which the motion may tell the heading, in times of how far positions are off (noise, and drift of their
@@ -212,7 +212,7 @@ def _level(
     if problem.config.sensors[problem.imu.sensor].gravity == "removed":
         return np.eye(3), 0.1, None, "roll and pitch unknown (gravity removed by the driver): taken level"
     t, f, _ = samples_of(problem, 0.0, still[1] if still else min(window, 10.0))
-    span = float(np.ptp(t))  # online, a start comes before ten seconds have
+    span = float(np.ptp(t))  # online, the run may be shorter than ten seconds
     R = np.array([turn(s) for s in t])
     forces = np.einsum("nij,nj->ni", R, f)
     force = float(np.linalg.norm(forces.mean(axis=0)))

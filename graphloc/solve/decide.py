@@ -175,7 +175,7 @@ def _by_kernel(
     # The norm of k whitened residuals is about sqrt(k): the threshold is larger by that.
     dof = len(residuals[0][0].raw)
     times, white = scatter_of(best, dof), 1.0
-    if times > 1.0 and not stream.row.absolute:  # of positions, a shared error may be that of the estimate
+    if times > 1.0 and not stream.row.absolute:  # an error that positions share may be the estimate's
         stamps_ns = np.array([stream.measurements[i].stamp_ns for i in indices])
         normal = np.array([found[m].normalised() for m, found in zip(mode, residuals, strict=True)])
         times = min(times, scatter_of_pairs(stamps_ns, normal))

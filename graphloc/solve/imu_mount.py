@@ -161,7 +161,7 @@ def by_turn(J: Any, n: int) -> Array:
     U = np.zeros((J.shape[1], 3))
     U[-6 * n :].reshape(n, 6, 3)[:, :3] = np.eye(3)
     c, links = np.asarray(J @ U), 9 * (n - 1)
-    biases = np.flatnonzero(abs(J[:links, : -9 * n]).sum(axis=0))  # all that the IMU has beside poses and velocities
+    biases = np.flatnonzero(abs(J[:links, : -9 * n]).sum(axis=0))  # columns in its rows besides poses and velocities
     levelling = np.asarray(abs(J[links:, biases]).sum(axis=1)).ravel() > 0.0
     c[links:][~levelling] = 0.0
     return c

@@ -29,7 +29,7 @@ from graphloc.time import NS_PER_S, stamps_of, utc_text
 
 # Sigmas from which a mount is said to be turned; share of a prior's variance that others must take off it.
 _TURNED, _TOLD = 2.5, 0.1
-_MUCH_NOISIER = 1.5  # times what is stated, from which it is said: bounds would be a third too small; a choice
+_MUCH_NOISIER = 1.5  # times what is stated, from which a warning is given: bounds would be a third too small; a choice
 _SMALL_M = 0.1  # a slow error that is smaller is that of RTK
 _TOGETHER_S = 5.0  # shortest row of refused measurements that is said, if so many in a row are unlikely to be false
 _BY_CHANCE = 1e-3  # probability below which that is unlikely, anywhere in the run; a choice
@@ -125,7 +125,7 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
     value = result.values.atVector(keys.slow(stream.number, 0))
     far = np.where(slow.constant, np.abs(value) / slow.sigma, 0.0)
     if slow.late is not None:
-        far[slow.late] = 0.0  # it is no mount (`late_far_off`)
+        far[slow.late] = 0.0  # a delay is no mount (`late_far_off`)
     k = int(np.argmax(far))
     where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.3g} {slow.units[k]}"
     cure = "check its mount and the IMU's, or raise the configured sigma"
