@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a recording to the graph of any stretch of it.
 
-A `Problem` holds what does not change while solving: timeline, preintegrated links, and per sensor a
-`Stream` of measurements with the state that each attaches to. `build_graph` turns a stretch of it into
-factors, at the current estimate and with the current decisions. It knows sensors only as rows.
+A `Problem` holds what does not change while solving: the timeline, preintegrated links, and per sensor a `Stream` of
+measurements with the state that each attaches to. `build_graph` turns a stretch of it into factors, at the current
+estimate and with the current decisions. It knows sensors only by their rows.
 
-The states stand where the IMU stands, with the axes of the body: inertial data then need no lever arm,
-whose Euler term GTSAM's preintegration leaves out. Every other mount is taken from there, and the
-solution is moved to the body's origin at the end (`graphloc.solve`).
+The states stand where the IMU stands, with the axes of the body. Inertial data then need no lever arm, whose Euler term
+GTSAM's preintegration leaves out. Lever arms of the other sensors are taken from there, and the solution is moved to
+the body's origin at the end (`graphloc.solve`).
 """
 
 from graphloc.build._attach import (

@@ -17,10 +17,10 @@ from graphloc.graph import TIME_OFFSET, Attachment, Constant, FeltMotion, Sensor
 from graphloc.inertial import InertialLink
 from graphloc.measurements import NO_HEIGHT_M2, Measurement
 
-_NO_HEIGHT_M2 = np.array([0.0, 0.0, NO_HEIGHT_M2])  # adds to a fix what leaves its height without weight
+_NO_HEIGHT_M2 = np.array([0.0, 0.0, NO_HEIGHT_M2])  # variance that leaves the height of a fix without weight
 
 Carry = tuple[int, Any]
-"""Number of a state, and the motion preintegrated from there to a measurement."""
+"""Number of a state, and the motion preintegrated from it to a measurement."""
 
 
 class Stamps(Protocol):
@@ -65,7 +65,7 @@ class Sited(Protocol):
 
     @property
     def links(self) -> InertialLink:
-        """Of the IMU."""
+        """Preintegration of the IMU."""
         ...
 
     @property
@@ -78,7 +78,7 @@ class Estimates(Protocol):
     """What `attach` needs to know of the values of states (`gtsam.Values`, or those of a window)."""
 
     def exists(self, j: int, /) -> bool:
-        """Whether there is a key."""
+        """Return whether a key has a value."""
         ...
 
     def atPose3(self, j: int, /) -> Any:
@@ -99,47 +99,47 @@ class Attaching(Protocol):
 
     @property
     def number(self) -> int:
-        """Of the sensor, for keys."""
+        """Number of the sensor, for keys."""
         ...
 
     @property
     def mount(self) -> Any:
-        """Pose of the sensor from the IMU, body axes."""
+        """Pose of the sensor seen from the IMU, body axes (gtsam.Pose3)."""
         ...
 
     @property
     def slow(self) -> SlowProcess | None:
-        """Its slow state."""
+        """Slow state of the sensor."""
         ...
 
     @property
     def without_height(self) -> bool:
-        """Whether the heights of its fixes are not used."""
+        """Whether the heights of the sensor's fixes are not used."""
         ...
 
     @property
     def constants(self) -> tuple[Constant, ...]:
-        """What its measurements may share."""
+        """Constants that the sensor's measurements may share."""
         ...
 
     @property
     def shares(self) -> int | None:
-        """Number of the sensor that has the same constants; None: they are its own."""
+        """Number of the sensor whose constants these are; None: they are the sensor's own."""
         ...
 
     @property
     def measurements(self) -> Any:
-        """By index."""
+        """Measurements, by index."""
         ...
 
     @property
     def state(self) -> Any:
-        """State of each."""
+        """State of each measurement."""
         ...
 
     @property
     def carry(self) -> Any:
-        """Motion from the state before each measurement to it."""
+        """Motion from the state before each measurement to it (`Carry`), or None."""
         ...
 
     @property
@@ -154,7 +154,7 @@ class Attaching(Protocol):
 
     @property
     def apart_s(self) -> Any:
-        """How far apart they come at each, s (`spacing_s`)."""
+        """Usual time between measurements at each of them, s (`spacing_s`)."""
         ...
 
 
@@ -163,17 +163,17 @@ class Judged(Attaching, Protocol):
 
     @property
     def name(self) -> str:
-        """Of the sensor."""
+        """Name of the sensor."""
         ...
 
     @property
     def row(self) -> Sensor:
-        """Of the table."""
+        """Row of the sensor in the table."""
         ...
 
     @property
     def config(self) -> Any:
-        """Of the sensor."""
+        """Configuration of the sensor."""
         ...
 
 
@@ -183,10 +183,14 @@ def nav_state(values: Estimates, k: int) -> Any:
 
 
 def state_of(m: Measurement, floor: int, nearest: int, stamps_ns: Stamps, holes: Sequence[tuple[int, int]]) -> int:
-    """Return the state that a measurement attaches to: the nearest, or the one before (`floor`) where an IMU gap lies in between.
+    """Return the state that a measurement attaches to: the nearest, or the one before where an IMU gap is in between.
 
-    The measurement is propagated from the state before it. Across a gap the motion to the nearest state is uncertain; written as a
-    factor of that state, the measurement would count as new information each time it is linearised.
+    The measurement is propagated from the state before it. Across a gap the motion to the nearest state is uncertain;
+    written as a factor of that state, the measurement would count as new information each time it is linearised.
+
+    Args:
+        floor, nearest: the state before the measurement, and the nearest one.
+        holes: gaps of the IMU (start, stop), ns.
     """
     start_ns, stop_ns = int(stamps_ns[floor]), int(stamps_ns[nearest])
     in_hole = nearest != floor and m.stamp_ns > start_ns and any(a < stop_ns and b > start_ns for a, b in holes)
@@ -234,12 +238,20 @@ def attach(problem: Sited, stream: Attaching, i: int, values: Estimates) -> Atta
 
 
 def asks_for_delay(constants: Sequence[Constant]) -> bool:
-    """Return whether the delay of a sensor's stamps is one of its constants: only then is asked what the IMU feels (0.2 ms each)."""
+    """Return whether the delay of a sensor's stamps is one of its constants.
+
+    Only then is it computed what the IMU feels at its measurements (0.2 ms each).
+    """
     return any(TIME_OFFSET in constant.corrects for constant in constants)
 
 
 def _felt(problem: Sited, raw: Array, carried_to: Any, bias: Any) -> FeltMotion:
-    """Return what the IMU feels; `carried_to`: the body at the measurement, seen from that at the state; None: it is the same."""
+    """Return what the IMU feels at a measurement, in the axes of the body at its state.
+
+    Args:
+        raw: (6,) as of `Attaching.felt`.
+        carried_to: the body at the measurement, seen from that at the state (gtsam.Pose3); None: it is the same.
+    """
     turn = np.eye(3) if carried_to is None else carried_to.rotation().matrix()
     force = raw[:3] - problem.R_body_imu @ bias.accelerometer()
     return FeltMotion(turn @ force, turn @ raw[3:], problem.links.gravity_mps2)
@@ -266,7 +278,7 @@ def _next_slow(
 
 
 def constants_of(stream: Attaching, values: Estimates) -> tuple[tuple[int, Array], ...]:
-    """Return keys and estimates of a sensor's constants; zero for those that no factor has yet."""
+    """Return keys and estimates of a sensor's constants; an estimate is zero where no factor has the constant yet."""
     if not stream.constants:
         return ()
     return tuple(
@@ -276,7 +288,7 @@ def constants_of(stream: Attaching, values: Estimates) -> tuple[tuple[int, Array
 
 
 def solved_constants(stream: Attaching, values: gtsam.Values) -> Iterator[tuple[Constant, Array]]:
-    """Yield the constants of a sensor that some factor has, and their values (k,)."""
+    """Yield those constants of a sensor that a factor has, and their values (k,)."""
     for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
         if values.exists(key):
             yield constant, values.atVector(key)
@@ -289,5 +301,5 @@ def constant_keys(stream: Attaching) -> list[int]:
 
 
 def every_constant(streams: Iterable[Attaching]) -> list[int]:
-    """Return the keys of the constants of some sensors, of shared ones once."""
+    """Return the keys of the constants of some sensors; a key that several share is there once."""
     return list(dict.fromkeys(key for stream in streams for key in constant_keys(stream)))

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Factors of slowly varying states: IMU biases, and the slow errors of sensors.
 
-A slow error is a first-order Gauss-Markov process (sigma s, time constant T), built from native factors. The density of its path,
-exp(-int x'^2/2q - int x^2/2p) with q = 2 s^2/T, p = 2 s^2 T, and x^2/4s^2 at both ends, is that of a random walk with a prior
-about 0 at each node. That is exact as the node period goes to 0, and a robust loss may then be put on the steps (a `JacobianFactor`
-that contains the decay takes none) and on the priors. Axes that may stay far off (`SlowProcess.far`) have priors with tails,
-w = 1 / (1 + x^2 / (F s)^2), so that of two levels between which the error jumps one is the usual one, near 0. Once it is known
-which nodes are at the usual level, only these have a prior (`at_level`).
+A slow error is a first-order Gauss-Markov process (sigma s, time constant T), built from native factors. The density of
+its path, exp(-int x'^2/2q - int x^2/2p) with q = 2 s^2/T, p = 2 s^2 T, and x^2/4s^2 at both ends, is that of a random
+walk with a prior about 0 at each node. That is exact as the node period goes to 0, and a robust loss may then be put on
+the steps (a `JacobianFactor` that contains the decay takes none) and on the priors. Axes that may stay far off
+(`SlowProcess.far`) have priors with tails, w = 1 / (1 + x^2 / (F s)^2), so that of two levels between which the error
+jumps one is the usual one, near 0. Once it is known which nodes are at the usual level, only these have a prior
+(`at_level`).
 """
 
 from __future__ import annotations
@@ -30,17 +31,18 @@ from graphloc.time import NS_PER_S, duration_ns
 # Loss of a step: beyond this many sigmas it counts as a jump.
 JUMP = KernelConfig(kind="cauchy", scale=2.0)
 _FAR = 2.0  # F in the prior of an axis that may stay far off: sigmas beyond which it counts as far off
-# Times the sigma of a constant's prior: the sigma of its part whose weight never changes, and twice the widest that the whole is made
-# by re-weighting. A vessel of 100 m has its antenna 20 m from where 1 m (1 sigma) was drafted.
+# Times the sigma of a constant's prior: the sigma of its part whose weight never changes, and twice the widest that the
+# whole is made by re-weighting. A vessel of 100 m has its antenna 20 m from where 1 m (1 sigma) was drafted.
 _WIDEST = 60.0
-_NOTHING = 1e6  # sigmas: no information
-_NO_DRIFT = 100.0  # times the time constant
-_SILENT = 3.0  # times the usual time between measurements
-_SPACED_OVER_S = 4.0  # longer than gateways hold messages back
+_NOTHING = 1e6  # sigmas of a prior without information
+_NO_DRIFT = 100.0  # factor on the time constant of a process that hardly drifts
+_SILENT = 3.0  # usual times between measurements, from which a sensor is silent
+_SPACED_OVER_S = 4.0  # time over which the spacing is taken: longer than gateways hold messages back
 SPACED_BY = 40
-"""Most measurements before one that tell how far apart they come (`spacing_s`): two seconds of the fastest that are used."""
-_IN_BOUNDS = 1.5  # sigmas of a slow error that the bounds include: jumps up to there need no word
-_CHAIN_END = 2.0  # variances of the process: the prior at either end of a chain
+"""Most measurements before one that tell how far apart they come (`spacing_s`): two seconds of the fastest that are
+used."""
+_IN_BOUNDS = 1.5  # sigmas of a slow error: size up to which the bounds include a jump, so that it needs no warning
+_CHAIN_END = 2.0  # variance of the prior at either end of a chain, in variances of the process
 
 
 def bias_step(links: InertialLink, j: int, from_ns: int, to_ns: int) -> Any:
@@ -55,8 +57,9 @@ def slow_begin(
     """Yield the priors of the first node of a chain.
 
     Args:
-        known: (k,) estimate of that node, by which the priors of constants are re-weighted; None: of these priors only the part whose
-            weight never changes (`never_revised`), and `slow_end` yields the other. jumps, far: as in `slow_step`.
+        known: (k,) estimate of that node, by which the priors of constants are re-weighted; None: of these priors only
+            the part whose weight never changes (`never_revised`), and `slow_end` yields the other. jumps, far: as in
+            `slow_step`.
     """
     constant = slow.constant
     if constant.any():
@@ -77,10 +80,10 @@ def _tails(slow: SlowProcess, value: Array) -> Array:
 def revisable(sigma: Array, widened: Array) -> Array:
     """Return the sigmas (k,) of the part of a constant's prior whose weight may still change.
 
-    The prior is two factors: a wide one (`never_revised`), and this one, re-weighted at the estimate; together they are as wide as
-    `widened`. Online a prior that was marginalised, or became part of an anchor, keeps the weight that it had then. As a single factor
-    it held an antenna that was 20 m from its mount (1 m, 1 sigma) back for good, by the weight of the first seconds, when the estimate
-    was still near the mount.
+    The prior is two factors: a wide one (`never_revised`), and this one, re-weighted at the estimate; together they are
+    as wide as `widened`. Online a prior that was marginalised, or became part of an anchor, keeps the weight that it
+    had then. As a single factor it held an antenna that was 20 m from its mount (1 m, 1 sigma) back for good, by the
+    weight of the first seconds, when the estimate was still near the mount.
 
     Args:
         sigma: (k,) of the prior. widened: (k,) of the prior re-weighted at the estimate.
@@ -89,7 +92,7 @@ def revisable(sigma: Array, widened: Array) -> Array:
 
 
 def never_revised(sigma: Array) -> Array:
-    """Return the sigmas (k,) of the part of a constant's prior whose weight never changes; the other part: `revisable`."""
+    """Return the sigmas (k,) of the part of a constant's prior whose weight never changes; the other: `revisable`."""
     return _WIDEST * sigma
 
 
@@ -108,8 +111,8 @@ def slow_step(
     """Yield the factors of the step to the next node, `dt_s` later.
 
     Args:
-        jumps: whether steps that may be jumps have a robust loss. far: whether axes that may stay far off have a prior here; if not,
-            `at_level` yields it.
+        jumps: whether steps that may be jumps have a robust loss. far: whether axes that may stay far off have a prior
+            here; if not, `at_level` yields it.
         jump_m: size of a position jump seen in this step: the error, or the vessel, has moved so far. 0: none.
         expected: (k,) mean of the step, where a jump was measured; None: 0.
         anew: whether the error is drawn anew: all axes but constants are then independent of what they were
@@ -134,7 +137,10 @@ def slow_step(
 
 
 def without_drift(slow: SlowProcess) -> SlowProcess:
-    """Return a slow process that hardly moves but where it jumps: nothing tells a drift from motion, but the IMU tells a jump."""
+    """Return a slow process that hardly moves but where it jumps.
+
+    Nothing tells a drift from motion, but the IMU tells a jump.
+    """
     return replace(slow, time_constant_s=_NO_DRIFT * slow.time_constant_s)
 
 
@@ -153,8 +159,8 @@ def slow_end(
     """Yield the priors that close a chain at its last node.
 
     Args:
-        value: (k,) estimate of that node, if the chain began without one (see `slow_begin`): the part of the constants' priors whose
-            weight may change is then yielded here. jumps, far: as in `slow_step`.
+        value: (k,) estimate of that node, if the chain began without one (see `slow_begin`): the part of the constants'
+            priors whose weight may change is then yielded here. jumps, far: as in `slow_step`.
     """
     yield from _standing(slow, key, np.full(len(slow.sigma), _CHAIN_END), jumps=jumps, far=far)
     if value is not None and (slow.constant & ~_with_no_tails(slow)).any():
@@ -171,8 +177,8 @@ def at_level(
 ) -> Iterator[Any]:
     """Yield the priors of a chain's axes that may stay far off, where it is known which nodes are at the usual level.
 
-    Nodes at the usual level have a Gaussian prior, as of a chain that begins at the first and ends at the last of them. The others
-    have none, because a jump may lead anywhere.
+    Nodes at the usual level have a Gaussian prior, as of a chain that begins at the first and ends at the last of them.
+    The others have none, because a jump may lead anywhere.
 
     Args:
         names: (N,) keys of the nodes. dt_s: (N - 1,) times between them. usual: (N,) which are at the usual level.
@@ -186,7 +192,8 @@ def at_level(
 def spacing_s(stamps_ns: NDArray[np.int64]) -> Array:
     """Return the mean time (M,), s, between measurements in the seconds before each; inf for one with none before it.
 
-    The time since the one before, or the median, would not do: a gateway may send five fixes within 10 ms, twice a second.
+    The time since the one before, or the median, would not do: a gateway may send five fixes within 10 ms, twice a
+    second.
 
     Args:
         stamps_ns: (M,) in order.
@@ -194,16 +201,16 @@ def spacing_s(stamps_ns: NDArray[np.int64]) -> Array:
     at = np.arange(len(stamps_ns))
     first = np.maximum(np.searchsorted(stamps_ns, stamps_ns - duration_ns(_SPACED_OVER_S)), at - SPACED_BY)
     mean_s = (stamps_ns - stamps_ns[first]) / NS_PER_S / np.maximum(at - first, 1)
-    return np.where(at > first, np.round(mean_s, 3), np.inf)  # rounded: many are then alike, and reckoned once
+    return np.where(at > first, np.round(mean_s, 3), np.inf)  # rounded: equal ones are computed once
 
 
 @lru_cache(maxsize=256)  # many measurements are equally far apart
 def walk_between_nodes(slow: SlowProcess, period_s: float, apart_s: float) -> Array:
     """Return the variance (k,) to add to each measurement, because its slow error walks on between two nodes.
 
-    n measurements, h apart, share one node. Whatever their noise, their mean is off by the mean walk since the first, of
-    variance q h (n - 1)(2n - 1) / 6n; so each gets n times that. Without it, fixes good to centimetres would determine the
-    speed to centimetres per second, although their slow error walks by decimetres.
+    n measurements, h apart, share one node. Whatever their noise, their mean is off by the mean walk since the first,
+    of variance q h (n - 1)(2n - 1) / 6n; so each gets n times that. Without it, fixes good to centimetres would
+    determine the speed to centimetres per second, although their slow error walks by decimetres.
 
     Args:
         period_s: of the nodes. apart_s: h.
@@ -231,7 +238,8 @@ def standing_cost(slow: SlowProcess, path: Array, dt_s: Array, anew: NDArray[np.
     """Return the cost (nats) of a whole chain's priors, of the axes that may stay far off.
 
     Args:
-        path: (N, k) estimates of the nodes. dt_s: (N - 1,) times between them. anew: (N - 1,) steps at which the error is drawn anew.
+        path: (N, k) estimates of the nodes. dt_s: (N - 1,) times between them. anew: (N - 1,) steps at which the error
+            is drawn anew.
     """
     far = slow.far_axes
     square = ((path[:, far] / slow.sigma[far]) ** 2).sum(axis=1)
@@ -242,7 +250,10 @@ def standing_cost(slow: SlowProcess, path: Array, dt_s: Array, anew: NDArray[np.
 def _usual_information(
     slow: SlowProcess, dt_s: Array, usual: NDArray[np.bool_], anew: NDArray[np.bool_] | None
 ) -> Array:
-    """Return the information (N,), in 1 / sigma^2, of a chain's priors about 0; each part between `anew` begins and ends at a `usual` node."""
+    """Return the information (N,), in 1 / sigma^2, of a chain's priors about 0.
+
+    Each part of the chain between steps of `anew` begins and ends at a `usual` node.
+    """
     steps = dt_s / (2.0 * float(slow.time_constant_s[slow.far_axes].max()))
     begins = np.flatnonzero(np.zeros(len(dt_s)) if anew is None else anew) + 1
     held = np.concatenate([[0.0], steps])
@@ -256,10 +267,10 @@ def _usual_information(
 
 
 def _standing(slow: SlowProcess, key: int, times: Array, *, jumps: bool, far: bool) -> Iterator[Any]:
-    """Yield the priors about 0 of a node; their variances are `times` (k,) those of the process. Constants have none here.
+    """Yield the priors about 0 of a node; their variances are `times` (k,) those of the process.
 
-    Axes that may stay far off have a prior of their own, or none (`far`). In one prior with the others, a height above another zero
-    would loosen the horizontal axes.
+    Constants have none here. Axes that may stay far off have a prior of their own, or none (`far`). In one prior with
+    the others, a height above another zero would loosen the horizontal axes.
     """
     held, tailed = ~slow.constant & (far | ~slow.far_axes), slow.far_axes & jumps
     for part in (held & ~tailed, held & tailed):

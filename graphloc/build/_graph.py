@@ -24,12 +24,14 @@ from graphloc.linear import factors_of
 class Level:
     """Levelling: the vertical, from the mean specific force over some time in axes propagated by the gyroscope.
 
-    It depends on the biases. Used as a prior on roll and pitch alone, a levelling that was 20 mrad off bent the accelerometer bias
-    by 30 mm/s^2 for a minute: the run determines tilt minus bias to 2 mrad, but each of them only after the vessel has turned.
+    It depends on the biases, so its factor has them, too. When it was a prior on roll and pitch alone, a levelling that
+    was 20 mrad off bent the accelerometer bias by 30 mm/s^2 for a minute: the run determines tilt minus bias to 2 mrad,
+    but each of them only after the vessel has turned.
 
     Attributes:
-        up: (3,), unit, in the body's axes at the first state, at `bias`. by_bias: (3, 6) its derivative by the bias.
-        bias: (6,), accelerometer first. sigma_rad: of roll and pitch, at the true bias.
+        up: (3,) unit vector upwards, body axes at the first state, with the biases `bias`.
+        by_bias: (3, 6) derivative of `up` by the biases. bias: (6,), accelerometer first.
+        sigma_rad: sigma of roll and pitch, at the true biases.
     """
 
     up: Array
@@ -38,14 +40,14 @@ class Level:
     sigma_rad: float
 
     def turned(self, turn: Array) -> Level:
-        """Return it as measured by an IMU whose mount is turned by a rotation (3, 3), body axes."""
+        """Return the levelling by an IMU whose mount is turned by a rotation (3, 3), body axes."""
         return replace(self, up=turn @ self.up, by_bias=turn @ self.by_bias)
 
     def error(self, R: Array, bias: Array) -> tuple[Array, Array, Array]:
         """Return the horizontal part (2,) of `up` in world, in sigmas, and its Jacobians.
 
         Args:
-            R: (3, 3), body in world. bias: (6,).
+            R: (3, 3), body in world. bias: (6,), accelerometer first.
 
         Returns:
             Error (2,), Jacobian (2, 3) by the body tangent of the attitude, Jacobian (2, 6) by the bias.
@@ -57,14 +59,16 @@ class Level:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartPrior:
-    """Gaussian prior on the first state of a stretch: pose, velocity and bias, independent of each other but for `level`.
+    """Gaussian prior on the first state of a stretch: pose, velocity and bias, independent but for `level`.
 
     Attributes:
         pose: gtsam.Pose3, body in world. pose_cov: (6, 6), body tangent, rotation first.
         velocity: (3,) m/s, world axes. velocity_cov: (3, 3).
         bias: gtsam.imuBias.ConstantBias. bias_cov: (6, 6), accelerometer first.
-        level: levelling of roll and pitch, which ties them to the bias (their part of `pose_cov` is wide then); None: no such factor.
-        slow: value (k,) and covariance (k, k) of slow states, by sensor number. Those that it lacks have the prior of their process.
+        level: levelling of roll and pitch, which ties them to the bias (their part of `pose_cov` is wide then); None:
+            no such factor.
+        slow: value (k,) and covariance (k, k) of slow states, by sensor number. A slow state that is not in it has the
+            prior of its process.
     """
 
     pose: Any
@@ -77,7 +81,7 @@ class StartPrior:
     slow: Mapping[int, tuple[Array, Array]] = field(default_factory=dict)
 
     def with_imu_turned(self, turn_rad: Array) -> StartPrior:
-        """Return it as levelled by an IMU whose mount is turned by a small rotation (3,), rad, body axes."""
+        """Return the prior levelled by an IMU whose mount is turned by a small rotation (3,), rad, body axes."""
         if self.level is None:
             return self
         return replace(self, level=self.level.turned(gtsam.Rot3.Expmap(turn_rad).matrix()))
@@ -85,12 +89,12 @@ class StartPrior:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Past:
-    """All data before a stretch as a joint prior on its first state, its slow states and constants.
+    """All data before a stretch, as a joint prior on its first state, its slow states and constants.
 
     It is joint because position and slow error of a receiver may each be hardly known, but their sum well.
 
     Attributes:
-        factors: linear ones. known: the keys that they have.
+        factors: linear factors. known: the keys that they have.
     """
 
     factors: gtsam.NonlinearFactorGraph
@@ -99,7 +103,12 @@ class Past:
 
 @dataclass(slots=True, eq=False)
 class Decided:
-    """How a measurement enters graphs; `residual`: of the decision's hypothesis at the attachment, None: not reckoned yet."""
+    """How a measurement enters graphs.
+
+    Attributes:
+        decision: mode, weight and loss. at: its attachment.
+        residual: of the mode of `decision`, at the attachment; None: not computed yet.
+    """
 
     decision: Decision
     at: Attachment
@@ -107,7 +116,7 @@ class Decided:
     _update: GraphUpdate | None = field(init=False, default=None)
 
     def update(self, stream: Stream, i: int) -> GraphUpdate:
-        """Return the factors of measurement `i`; they are made once, as several graphs may have them."""
+        """Return the factors of measurement `i`. They are made once, because several graphs may have them."""
         if self._update is None:
             m, config = stream.measurements[i], stream.config
             self._update = factors_of(stream.row, m, config, self.at, self.decision, self.residual)
@@ -115,8 +124,9 @@ class Decided:
 
 
 Made = dict[tuple[int, int], range]
-"""By (stream number, measurement index): where its factors stand in a graph."""
-# By the same; missing or None: left out of the graph.
+"""By (stream number, measurement index): the range of the measurement's factors in a graph."""
+# By (stream number, measurement index). A measurement that is missing, or whose value is None, is left out of the
+# graph.
 Decisions = Mapping[tuple[int, int], Decided | None]
 
 
@@ -131,12 +141,15 @@ def build_graph(
     jumps: bool = True,
     made: Made | None = None,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Return the graph of states first..last and the values of its keys.
+    """Return the graph of states first..last (inclusive), and the values of its keys.
 
     Args:
-        jumps: whether slow states may jump where their process allows it. Not while the estimate may be far off: a GNSS error that
-            may jump explains a dead-reckoned track that is 300 m off at less cost than correcting the track.
-        made: filled with the range of factors of each measurement in the graph; those between states come first.
+        values: the estimate at which factors that depend on it are built. decisions: on the measurements.
+        prior: on the first state.
+        jumps: whether slow states may jump where their process allows it. Not while the estimate may be far off: a GNSS
+            error that may jump explains a dead-reckoned track that is 300 m off at less cost than correcting the track.
+        made: filled with the range of factors of each measurement in the graph. The factors between states come before
+            them.
     """
     graph, guess = gtsam.NonlinearFactorGraph(), values.extract(state_keys(problem, first, last))
     for k in range(first, last):
@@ -174,7 +187,7 @@ def _add_measurements(
         if decided is None:
             continue
         at = decided.at
-        if at.slow_next is not None and not guess.exists(at.slow_next[0]):  # it lies beyond the stretch
+        if at.slow_next is not None and not guess.exists(at.slow_next[0]):  # it is beyond the stretch
             decided = Decided(decided.decision, replace(at, slow_next=None))
         update = decided.update(stream, i)
         if made is not None:
@@ -200,7 +213,11 @@ def state_keys(problem: Problem, first: int, last: int) -> list[int]:
 
 
 def cost_of_constants(problem: Problem, values: gtsam.Values, known: Collection[int]) -> float:
-    """Return -log of how probable the constants in `values` are, but for a constant, without those of the keys `known`."""
+    """Return -log of the probability of the constants in `values`, up to an additive constant.
+
+    Args:
+        known: keys of constants that do not count.
+    """
     cost, seen = 0.0, set(known)
     for stream in problem.streams:
         for (key, value), constant in zip(constants_of(stream, values), stream.constants, strict=True):
@@ -217,10 +234,13 @@ def _add_constants(
     values: gtsam.Values,
     prior: StartPrior | Past,
 ) -> None:
-    """Add the constants that a factor of this stretch has, each with its prior, re-weighted at every pass."""
+    """Add the constants that factors of this stretch have, each with its prior, re-weighted at the estimate.
+
+    A constant that a `Past` knows has its prior there.
+    """
     used = set(graph.keyVector()) if stream.constants else set()
     for (key, known), constant in zip(constants_of(stream, values), stream.constants, strict=True):
-        if key in used and not guess.exists(key):  # two sensors may share it
+        if key in used and not guess.exists(key):  # two sensors may share a constant
             guess.insert(key, known)
             if isinstance(prior, Past) and key in prior.known:
                 continue
@@ -232,12 +252,19 @@ def _add_constants(
 def _step(
     slow: SlowProcess, key: int, following: int, dt_s: float, jumps: bool, far: bool, jump_m: float, anew: bool
 ) -> tuple[Any, ...]:
-    """Factors of a step, made once: they do not depend on the estimate, so every graph shares them."""
+    """Return the factors of a step of a slow state (`slow_step`).
+
+    They do not depend on the estimate, so they are made once and shared by all graphs.
+    """
     return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, far=far, jump_m=jump_m, anew=anew))
 
 
 def _jumps_m(problem: Problem, stream: Stream) -> dict[int, float]:
-    """Return by slow node the size (m) of the position jump before the next node, from the last fix before it to the first after."""
+    """Return, by slow node, the size (m) of the position jump in the step to the next node.
+
+    A jump is somewhere between the last fix before it and the first fix after it, so each step between these has its
+    size.
+    """
     found: dict[int, float] = {}
     if not len(stream.position_jumps[0]):
         return found

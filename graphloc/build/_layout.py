@@ -32,10 +32,13 @@ _NO_JUMPS: PositionJumps = np.zeros(0, dtype=np.int64), np.zeros(0)
 
 
 def mount_of(name: str, config: SensorConfig, mounts: Mounts) -> tuple[Array, Array]:
-    """Return the mount of a sensor in body (t (3,), m; R (3, 3)): from /tf_static where configured so.
+    """Return the mount of a sensor in body: t (3,), m, and R (3, 3).
+
+    Args:
+        mounts: mounts read from /tf_static, by sensor.
 
     Raises:
-        InputError: it is configured so, and not among these mounts.
+        InputError: the mount is configured as a frame of /tf_static, and is not in `mounts`.
     """
     if config.mount.tf_frame and name not in mounts:
         raise InputError(
@@ -52,13 +55,14 @@ _OF_THE_RECEIVER = _OF_AN_ANTENNA | {"stamps", "time_offset_s", "clock_drift_ppm
 def shared_constants(
     name: str, config: VesselConfig, rows: Mapping[str, Sensor]
 ) -> tuple[tuple[Constant, ...], int | None]:
-    """Return the constants of a sensor, and the number of the sensor that has them, too; None: no other has, or they are said of this one.
+    """Return the constants of a sensor, and the number of the sensor whose constants they are; None: they are its own.
 
-    Those that read one receiver by turns have one antenna and one clock; a velocity of that antenna has a delay of its own beside: a receiver may
-    filter it, or send it later. All are one constant, as a linear factor of more than three states takes longer to make.
+    Sensors that read one receiver by turns have one antenna and one clock. A sensor of that antenna's velocity shares
+    the antenna, but has a delay of its own besides: a receiver may filter velocities, or send them later. Whatever a
+    group of sensors shares is one constant, as a linear factor of more than three states takes longer to make.
 
     Args:
-        rows: of all enabled sensors.
+        rows: of all enabled sensors, by name.
     """
     first, own = config.antenna_of(name), rows[name].constants(config.sensors[name])
     sharing = [n for n in rows if n != first and config.antenna_of(n) == first and _alike(n, first, config)]
@@ -84,7 +88,7 @@ def shared_constants(
 
 
 def _alike(name: str, first: str, config: VesselConfig) -> bool:
-    """Whether a sensor shares something unknown with another of its antenna: else it is set otherwise."""
+    """Return whether a sensor is set like the first one of its antenna, and something that they share is unknown."""
     keys = _OF_THE_RECEIVER if config.receiver_of(name) == first else _OF_AN_ANTENNA
     block, other = (config.sensors[of].model_dump(include=keys) for of in (name, first))
     unknown = config.sensors[first].mount_sigma_m > 0.0 or (
@@ -94,29 +98,39 @@ def _alike(name: str, first: str, config: VesselConfig) -> bool:
 
 
 def rows_of(config: VesselConfig, rows: Sequence[Sensor]) -> dict[str, Sensor]:
-    """Return the row of each enabled sensor, as it is configured."""
+    """Return the row of each enabled sensor as it is configured, by name."""
     return {name: row.of(block) for row in rows for name, block in config.of_kind(row.kind).items()}
 
 
 def company_of(config: VesselConfig, rows: Sequence[Sensor], seen: Container[str] | None = None) -> int:
-    """Return how many sensors (of those in `seen`, if given) can separate each other's slow errors from motion."""
+    """Return the number of sensors that can separate each other's slow errors from motion.
+
+    Args:
+        seen: names of the sensors that count; None: all that are enabled.
+    """
     return sum(row.company and (seen is None or name in seen) for name, row in rows_of(config, rows).items())
 
 
 def slow_or_left_out(row: Sensor, config: SensorConfig, company: int) -> tuple[SlowProcess | None, SlowProcess | None]:
-    """Return a sensor's slow state, and the one that is left out instead, as nothing could tell it from motion: one of them, or none.
+    """Return a sensor's slow state, and the slow state that is left out because nothing could tell it from motion.
+
+    One of them is None, or both.
 
     Args:
-        company: how many sensors can separate each other's slow errors from motion.
+        company: number of sensors that can separate each other's slow errors from motion.
     """
     slow = row.slow(config)
     return (None, slow) if slow is not None and slow.needs_company and company < 2 else (slow, None)
 
 
 def height_told_better(config: VesselConfig, rows: Sequence[Sensor], left_out: SlowProcess | None) -> bool:
-    """Whether a known height (a waterline) is known better than fixes tell it whose slow error is left out: then theirs are not used.
+    """Return whether a known height (a waterline) is better known than by fixes whose slow error is left out.
 
-    Hundreds of them would outvote it, as if their errors were white.
+    Then the heights of these fixes are not used: hundreds of them would outvote the known height, as if their errors
+    were white.
+
+    Args:
+        left_out: the slow error (east, north, up) of the fixes that is left out; None: none is.
     """
     known_m = [
         math.hypot(block.sigma_m, block.offset_sigma_m) for row in rows if row.synthetic is not None
@@ -126,7 +140,7 @@ def height_told_better(config: VesselConfig, rows: Sequence[Sensor], left_out: S
 
 
 def _gap_warning(gaps: Sequence[tuple[int, int]]) -> list[str]:
-    """Return a line on the gaps of the IMU, (start, stop) in ns: a radio link that drops out has dozens."""
+    """Return a warning on the gaps of the IMU, (start, stop) in ns: one line, as a bad radio link makes dozens."""
     if not gaps:
         return []
     longest_s, first = max(b - a for a, b in gaps) / 1e9, utc_text(gaps[0][0])
@@ -147,7 +161,10 @@ def make_problem(
     """Lay out the timeline, preintegrate, and attach every measurement.
 
     Args:
-        company: how many sensors can separate each other's slow errors from motion; default: counted in the recording.
+        recording: what was measured. config: the vessel. datum: origin of world.
+        rows, inertial: the table of sensors (`graphloc.factors`).
+        company: number of sensors that can separate each other's slow errors from motion; by default as in the
+            recording.
 
     Raises:
         SolveError: the recording has no usable IMU data.
@@ -201,7 +218,11 @@ def _streams(
     mounts: Mounts,
     company: int,
 ) -> tuple[Stream, ...]:
-    """Return the streams of the sensors that have measurements, attached to the states of a problem that has none yet."""
+    """Return the streams of the sensors that have measurements, attached to the states of a problem without streams.
+
+    Args:
+        company: as of `make_problem`.
+    """
     by_name = rows_of(problem.config, rows)
     absolute = [name for name in by_sensor if by_name[name].absolute]
     alone = len({problem.config.receiver_of(name) for name in absolute}) == 1
@@ -251,9 +272,14 @@ def _with_jumps(
     *,
     alone: bool,
 ) -> tuple[SlowProcess | None, SlowProcess | None, PositionJumps]:
-    """Return `slow`, `left_out` and `position_jumps` of a `Stream`; `alone`: one sensor measures position."""
+    """Return `slow`, `left_out` and `position_jumps` of a `Stream`.
+
+    Args:
+        slow, left_out: as they are without position jumps. alone: whether a single receiver measures position.
+    """
     jumps = _NO_JUMPS
-    # What a receiver says with and without RTK is told apart by its slow errors, but neither holds the place while the other jumps.
+    # Sensors that read one receiver by turns (with and without RTK) have slow errors that are told apart, but none of
+    # these sensors holds the place while another one jumps.
     if alone and (slow is None or config.takes_turns) and row.absolute and row.false is None:
         jumps = _position_jumps(row, measurements, datum, allowed_jump_m(left_out or slow))
     if left_out is not None and len(jumps[0]):
@@ -262,10 +288,10 @@ def _with_jumps(
 
 
 def _drawn_anew(slow: SlowProcess | None, apart_s: Array, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return `anew` of a `Stream`: the slow nodes of the last measurements before it was silent.
+    """Return `anew` of a `Stream`: the slow nodes of the last measurements before a long silence of the sensor.
 
     Args:
-        apart_s: (M - 1,) between measurements. nodes: (M,) that of each.
+        apart_s: (M - 1,) between measurements. nodes: (M,) slow node of each measurement.
     """
     if slow is None or len(apart_s) == 0:
         return np.zeros(0, dtype=np.int64)
@@ -274,7 +300,7 @@ def _drawn_anew(slow: SlowProcess | None, apart_s: Array, nodes: NDArray[np.int6
 
 
 def jumping(stream: Stream, stamps_ns: NDArray[np.int64], sizes_m: Array) -> Stream:
-    """Return it with more position jumps (K,), ns and m."""
+    """Return a stream with more position jumps (K,): stamps, ns, and sizes, m."""
     known_ns, known_m = stream.position_jumps
     at = np.searchsorted(known_ns, stamps_ns)
     jumps = np.insert(known_ns, at, stamps_ns), np.insert(known_m, at, sizes_m)

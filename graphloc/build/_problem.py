@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What does not change while solving: timeline, preintegrated motion, and where each measurement attaches.
 
-Where something of it does change, as the noise of the IMU, a new problem takes its place.
+If a part of it has to change, such as the noise of the IMU, a new problem takes its place.
 """
 
 from __future__ import annotations
@@ -37,18 +37,21 @@ class Stream:
 
     Attributes:
         number: of the sensor, for keys. name, row, config: name, row of the table and configuration of the sensor.
-        slow: its slow state, or None. left_out: the slow state that it would have beside a second position sensor, or None.
-        without_height: whether the heights of its fixes are not used (`height_told_better`).
+        slow: its slow state, or None. left_out: the slow state that it would have beside a second position sensor, or
+            None.
         position_jumps: those of a receiver that alone measures position.
         constants: those that its measurements depend on.
         mount: pose of the sensor seen from the IMU, body axes (gtsam.Pose3).
-        measurements: M of them by stamp. state: (M,) the state of each (`state_of`). carry: for each, the preintegrated motion
-            from the state before it; None where its stamp is that of a state.
-        gyro_radps: (M, 3) raw rate at each measurement, body axes. felt: (M, 6) raw specific force and change of the rate about it; 0 where no delay is asked for.
+        measurements: M of them by stamp. state: (M,) the state of each (`state_of`). carry: for each, the preintegrated
+            motion from the state before it; None where its stamp is that of a state.
+        gyro_radps: (M, 3) raw rate at each measurement, body axes.
+        felt: (M, 6) raw specific force and change of the rate about each measurement, body axes; 0 where no delay is
+            estimated.
         apart_s: (M,) usual time between measurements, s, at each (`spacing_s`).
-        shares: number of the sensor that has the same constants (`shared_constants`); None: they are its own.
-        anew: after which slow nodes (K,) its slow error is drawn anew.
-        usual: at which slow nodes (N,) its error is at its usual level; None: not known (see `solve/_levels.py`).
+        anew: slow nodes (K,) after which its slow error is drawn anew.
+        usual: (N,) at which slow nodes its error is at its usual level; None: not known (see `solve/_levels.py`).
+        shares: number of the sensor whose constants these are (`shared_constants`); None: they are its own.
+        without_height: whether the heights of its fixes are not used (`height_told_better`).
     """
 
     number: int
@@ -72,12 +75,12 @@ class Stream:
     without_height: bool = False
 
     def between(self, first: int, last: int) -> range:
-        """Indices of the measurements that attach to states first..last (inclusive)."""
+        """Return the indices of the measurements that attach to states first..last (inclusive)."""
         lo, hi = np.searchsorted(self.state, [first, last + 1])
         return range(int(lo), int(hi))
 
     def only(self, indices: NDArray[np.int64]) -> Stream:
-        """Return it with these of its measurements alone."""
+        """Return the stream with some of its measurements alone."""
         few = indices.tolist()
         measurements = tuple(self.measurements[i] for i in few)
         return replace(
@@ -87,7 +90,7 @@ class Stream:
             carry=tuple(self.carry[i] for i in few),
             gyro_radps=self.gyro_radps[indices],
             felt=self.felt[indices],
-            # Each stands for those that are left out before it.
+            # Each stands for the measurements before it that are left out.
             apart_s=np.diff(stamps_of(measurements) / NS_PER_S, prepend=-np.inf),
         )
 
@@ -99,17 +102,17 @@ class Problem:
     Attributes:
         config: of the vessel. datum: origin of world. timeline: stamps of the states and slow nodes.
         imu: samples of the IMU.
-        t_body_imu_m, R_body_imu: (3,), (3, 3) mount of the IMU in body. imu_turn_rad: (3,) by which it is turned against the configured
-            mount, body axes.
+        t_body_imu_m, R_body_imu: (3,), (3, 3) mount of the IMU in body.
         relink: returns the links of the IMU for its configuration, a noise scale and the rotation (3, 3) of its mount.
         links: preintegration of the IMU, with its noise scaled by `noise_scale`.
-        preintegrated, inertial: motion from each state to the next, and its factor. Neither depends on the estimate, so all graphs
-            share them.
+        preintegrated, inertial: motion from each state to the next, and its factor. Neither depends on the estimate, so
+            all graphs share them.
         streams: measurements of each sensor, and where they attach.
         rejected: ledger rows of measurements that the graph cannot take.
         warnings: one line each, for the report.
-        silent: clauses on why sensors have no measurement here.
-        left_out: spans (after one stamp until another, ns) whose samples of the IMU are left out.
+        silent: clauses for errors, on why sensors have no measurement here.
+        left_out: spans (after one stamp until another, ns) in which samples of the IMU are left out.
+        imu_turn_rad: (3,) by which the IMU's mount is turned against the configured one, body axes.
         usual_motion: where the motion model is used; None before there is an estimate, and where nothing needs it.
     """
 
@@ -134,7 +137,7 @@ class Problem:
 
 
 def preintegrate(timeline: Timeline, links: InertialLink) -> tuple[Any, ...]:
-    """Return the preintegrated motion from each state to the next, at no bias."""
+    """Return the preintegrated motion from each state to the next, at zero bias."""
     zero = gtsam.imuBias.ConstantBias()
     stamps = [int(s) for s in timeline.stamps_ns]
     return tuple(links.integrate(a, b, zero) for a, b in pairwise(stamps))
@@ -146,29 +149,37 @@ def inertial_factors(timeline: Timeline, links: InertialLink, preintegrated: Seq
 
 
 def with_noise_scale(problem: Problem, noise_scale: float) -> Problem:
-    """Return the problem with the IMU's noise densities scaled."""
+    """Return the problem with the configured noise densities of the IMU scaled by `noise_scale`."""
     return _relinked(problem, problem.config, noise_scale)
 
 
 def with_imu_noise(problem: Problem, gyro: float, accel: float) -> Problem:
-    """Return the problem with the configured noise densities of gyroscope and accelerometer so many times as large."""
+    """Return the problem with the configured noise densities of its IMU multiplied by a factor per kind of sensor."""
     return with_imu_scaled(problem, _imu_noise_times(gyro, accel))
 
 
 def with_imu_scaled(problem: Problem, times: Mapping[str, float]) -> Problem:
-    """Return the problem with numbers of the configuration of its IMU so many times as large; `times`: by key."""
+    """Return the problem with numbers in the configuration of its IMU multiplied by factors.
+
+    Args:
+        times: factors, by key of the configuration.
+    """
     return _relinked(problem, problem.config.scaled({problem.imu.sensor: times}), problem.noise_scale)
 
 
 def with_sensor_noise(problem: Problem, times: Mapping[str, Mapping[str, float]]) -> Problem:
-    """Return the problem with sigmas of its sensors so many times as large; `times`: by sensor and key of its configuration."""
+    """Return the problem with sigmas of its sensors multiplied by factors.
+
+    Args:
+        times: factors, by sensor and key of its configuration.
+    """
     config = problem.config.scaled(times)
     streams = tuple(replace(stream, config=config.sensors[stream.name]) for stream in problem.streams)
     return replace(problem, config=config, streams=streams)
 
 
 def noisier_imu(sensor: Any, gyro: float, accel: float) -> Any:
-    """Return the configuration of an IMU with noise densities so many times as large."""
+    """Return the configuration of an IMU with its noise densities multiplied by a factor each."""
     return sensor.scaled(_imu_noise_times(gyro, accel))
 
 
@@ -192,7 +203,11 @@ def _links(
 
 
 def without_imu(problem: Problem, values: gtsam.Values, after_ns: int, until_ns: int) -> Problem:
-    """Return the problem without the samples of the IMU after one stamp until another, bridged as a gap by `values`."""
+    """Return the problem without the IMU's samples after one stamp until another: a gap, bridged by an estimate.
+
+    Args:
+        values: estimate whose motion before the gap goes on in it.
+    """
     left_out = (*problem.left_out, (after_ns, until_ns))
     links = _links(problem, problem.config, problem.noise_scale, left_out)
     streams = tuple(_carried_anew(s, problem.timeline, links, after_ns, until_ns) for s in problem.streams)
@@ -200,7 +215,11 @@ def without_imu(problem: Problem, values: gtsam.Values, after_ns: int, until_ns:
 
 
 def with_imu_turned(problem: Problem, values: gtsam.Values, turn_rad: Array) -> Problem:
-    """Return the problem with the mount of its IMU turned by a small rotation (3,), rad, body axes; IMU gaps are bridged by `values`."""
+    """Return the problem with the mount of its IMU turned by a small rotation (3,), rad, body axes.
+
+    Args:
+        values: estimate whose motion before each IMU gap goes on in it.
+    """
     R = gtsam.Rot3.Expmap(turn_rad).matrix() @ problem.R_body_imu
     turned = replace(problem, R_body_imu=R, imu_turn_rad=problem.imu_turn_rad + turn_rad)
     turned = _relinked(turned, problem.config, problem.noise_scale)
@@ -220,7 +239,7 @@ def without_sensor(problem: Problem, stream: Stream) -> Problem:
 
 
 def _carried_anew(stream: Stream, timeline: Timeline, links: InertialLink, after_ns: int, until_ns: int) -> Stream:
-    """Return a stream whose measurements in a span are carried from their states by these links."""
+    """Return a stream with its measurements after one stamp until another carried from their states by other links."""
     zero, carry = gtsam.imuBias.ConstantBias(), list(stream.carry)
     gyro, felt = np.array(stream.gyro_radps), np.array(stream.felt)
     for i, (m, carried) in enumerate(zip(stream.measurements, carry, strict=True)):
@@ -236,13 +255,13 @@ def _carried_anew(stream: Stream, timeline: Timeline, links: InertialLink, after
 
 
 def with_links(problem: Problem, preintegrated: tuple[Any, ...]) -> Problem:
-    """Return the problem with other preintegrated motions from each state to the next, and their factors."""
+    """Return the problem with other preintegrated motions from each state to the next, and with their factors."""
     inertial = inertial_factors(problem.timeline, problem.links, preintegrated)
     return replace(problem, preintegrated=preintegrated, inertial=inertial)
 
 
 def bridged(problem: Problem, values: gtsam.Values) -> Problem:
-    """Return the problem with new links across IMU gaps: the vessel continues there as it moved before, by `values`."""
+    """Return the problem with new links across IMU gaps: the vessel moves on there as before, by `values`."""
     return _bridged(problem, values, problem.links.gaps())
 
 
@@ -261,7 +280,10 @@ def _bridged(problem: Problem, values: gtsam.Values, gaps: Sequence[tuple[int, i
 
 
 def with_usual_motion(problem: Problem, values: gtsam.Values) -> Problem:
-    """Return the problem with the motion model where no sensor measures position or velocity for a while, learned from `values`."""
+    """Return the problem with the motion model where no sensor measures position or velocity for long.
+
+    The model is learned from `values`.
+    """
     aided = sorted(m.stamp_ns for stream in problem.streams if stream.row.company for m in stream.measurements)
     found = usual_motion(problem.timeline, values, np.array(aided, dtype=np.int64), problem.links.gaps())
     return replace(problem, usual_motion=found)

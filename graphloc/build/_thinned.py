@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A thinned run: few states and measurements, enough for a rough track that the other measurements can be judged by.
+"""A thinned run: few states and measurements, enough for a rough track by which hypotheses can be judged.
 
-Sensors without hypotheses keep one measurement per slow node; those with hypotheses keep all. Between the states that these
-need, one preintegrated IMU link carries the same information as ten.
+Sensors without hypotheses keep one measurement per slow node; those with hypotheses keep all. Between the states that
+the kept measurements need, one preintegrated IMU link carries the same information as ten.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from graphloc.build._problem import Problem, Stream, with_links
 from graphloc.time import duration_ns
 from graphloc.timeline import Timeline
 
-_LONGEST_NS = duration_ns(1.0)  # of a link: up to here the first-order bias correction is accurate enough
+_LONGEST_NS = duration_ns(1.0)  # longest link: up to here the first-order bias correction is accurate enough
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +39,7 @@ class Thinned:
     chosen: Mapping[int, NDArray[np.int64]]
 
     def of(self, values: gtsam.Values) -> gtsam.Values:
-        """Return the values of the thinned run from those of the whole one."""
+        """Return the values of the thinned run, taken from those of the whole run."""
         nodes = range(len(self.problem.timeline.slow_stamps_ns))
         kept = values.extract(_shared_keys(self.problem, nodes, values))
         for k, whole in enumerate(self.states.tolist()):
@@ -48,7 +48,7 @@ class Thinned:
         return kept
 
     def filled(self, whole: Problem, values: gtsam.Values) -> gtsam.Values:
-        """Return the values of the whole run from those of this one; states in between are dead-reckoned."""
+        """Return the values of the whole run from those of the thinned one; the other states are dead-reckoned."""
         nodes = range(len(whole.timeline.slow_stamps_ns))
         filled = values.extract(_shared_keys(whole, nodes, values))
         for k, (first, following) in enumerate(pairwise([*self.states.tolist(), len(whole.timeline)])):
@@ -81,14 +81,18 @@ def thinned(problem: Problem) -> Thinned:
 
 
 def _chosen(problem: Problem, stream: Stream) -> NDArray[np.int64]:
-    """Return the indices of the measurements that are kept."""
+    """Return the indices of the measurements of a stream that are kept."""
     if stream.row.false is not None:
         return np.arange(len(stream.measurements))
     return np.flatnonzero(np.diff(problem.timeline.slow_of[stream.state], prepend=-1) > 0)
 
 
 def _states(problem: Problem, chosen: Mapping[int, NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Return the states that are kept: both ends, states of measurements or before them, slow nodes, one per second, and IMU gaps."""
+    """Return the states that are kept.
+
+    These are both ends; the first state of each slow node and of each second; the state of each kept measurement, and
+    that from which its motion is preintegrated; and all states about an IMU gap.
+    """
     timeline, last = problem.timeline, len(problem.timeline) - 1
     second = (timeline.stamps_ns - timeline.stamps_ns[0]) // _LONGEST_NS
     kept = [np.array([0, last]), *(np.flatnonzero(np.diff(n, prepend=-1) > 0) for n in (timeline.slow_of, second))]
@@ -96,7 +100,7 @@ def _states(problem: Problem, chosen: Mapping[int, NDArray[np.int64]]) -> NDArra
         indices = chosen[stream.number]
         kept.append(stream.state[indices])
         kept.append(np.array([c[0] for i in indices.tolist() if (c := stream.carry[i]) is not None], dtype=np.int64))
-    for start_ns, stop_ns in problem.links.gaps():  # bridged link by link
+    for start_ns, stop_ns in problem.links.gaps():  # gaps are bridged link by link
         kept.append(np.arange(timeline.floor(start_ns), min(timeline.floor(stop_ns) + 1, last) + 1))
     return np.unique(np.concatenate(kept))
 

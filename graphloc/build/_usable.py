@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a recording a graph can take, and what is said of the rest."""
+"""Which measurements of a recording a graph can take, and what is said of the others."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from graphloc.time import utc_text
 
 
 def usable_imu(recording: Recording, config: VesselConfig, kind: str) -> ImuSeries:
-    """Return the samples of the IMU, a sensor of some kind.
+    """Return the samples of the IMU.
+
+    Args:
+        kind: of the IMU, in the configuration.
 
     Raises:
-        SolveError: there are none, or too few.
+        SolveError: no sensor of this kind is enabled, or it has too few samples.
     """
     if not any(sensor.kind == kind and sensor.enabled for sensor in config.sensors.values()):
         raise SolveError(
@@ -34,7 +37,11 @@ def usable_imu(recording: Recording, config: VesselConfig, kind: str) -> ImuSeri
 
 
 def silent_sensors(recording: Recording, config: VesselConfig, heard: Container[str], imu: ImuSeries) -> str:
-    """Return clauses on why the sensors that are not `heard` have no measurement within the IMU's span."""
+    """Return clauses for errors: why enabled sensors have no measurement within the IMU's span.
+
+    Args:
+        heard: names of the sensors that have some.
+    """
     clauses, span = "", _span(imu)
     for name, sensor in config.sensors.items():
         if name in heard or not sensor.enabled or not sensor.topic or name == imu.sensor:
@@ -57,7 +64,11 @@ def _span(imu: ImuSeries) -> str:
 def sorted_out(
     recording: Recording, config: VesselConfig, kinds: Container[str], imu: ImuSeries
 ) -> tuple[list[Measurement], list[LedgerRow], list[str]]:
-    """Return the measurements that the graph can take, rows for the others, and warnings."""
+    """Return the measurements that the graph can take, ledger rows of the others, and warnings.
+
+    Args:
+        kinds: of the sensors that the graph takes measurements of. imu: what is outside its span is not taken.
+    """
     start, stop = int(imu.stamps_ns[0]), int(imu.stamps_ns[-1])
     asked_for = {name for name, sensor in config.sensors.items() if sensor.kind in kinds and sensor.enabled}
     inside, rows = [], []
@@ -72,7 +83,7 @@ def sorted_out(
             continue
         else:
             outside[m.sensor] += 1
-        if m.seq < 0:  # configuration, not a message
+        if m.seq < 0:  # made of the configuration, not a message
             outside[m.sensor] = 0
             continue
         rows.append(recording.row_of(m, outcome, reason))

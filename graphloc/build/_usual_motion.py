@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motion model, where no sensor measures position or velocity for a while."""
+"""The motion model, where no sensor measures position or velocity for long."""
 
 from __future__ import annotations
 
@@ -14,19 +14,27 @@ from numpy.typing import NDArray
 from graphloc.motion_model import MotionModel, Moving
 from graphloc.timeline import Timeline
 
-_UNAIDED_S = 10.0  # the IMU alone is far better than the model for less
+_UNAIDED_S = 10.0  # shortest time without such a sensor: for less, the IMU alone is far better than the model
 Span = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UsualMotion:
-    """What the vessel usually does, and the slow nodes from which to the next one it is assumed to do so."""
+    """What the vessel usually does, and where it is assumed to do so.
+
+    Attributes:
+        model: the motion model. nodes: slow nodes from which to the next one it is used.
+    """
 
     model: MotionModel
     nodes: frozenset[int]
 
     def factors(self, timeline: Timeline, values: gtsam.Values, nodes: Sequence[int], first: int) -> list[Any]:
-        """Return the factors of the steps between nodes of a stretch whose first state is `first`."""
+        """Return the factors of the model on the steps between slow nodes of a stretch.
+
+        Args:
+            nodes: slow nodes of the stretch. first: its first state.
+        """
         factors: list[Any] = []
         for j in nodes[:-1]:
             if j not in self.nodes:
@@ -41,11 +49,11 @@ class UsualMotion:
 def usual_motion(
     timeline: Timeline, values: gtsam.Values, aided_ns: NDArray[np.int64], holes: Sequence[Span]
 ) -> UsualMotion | None:
-    """Learn what the vessel usually does from where its motion is measured; None where it always is.
+    """Return what the vessel usually does, learned where its motion is measured; None if it is measured all the time.
 
     Args:
-        aided_ns: (K,) stamps of measurements of position or velocity, in order. holes: of the IMU, across which the rotation is
-            unknown, and so are the axes that the model is about.
+        aided_ns: (K,) stamps of measurements of position or velocity, in order.
+        holes: gaps of the IMU, across which the rotation is unknown, and with it the body axes that the model is about.
     """
     ends = np.concatenate([timeline.stamps_ns[:1], aided_ns, timeline.stamps_ns[-1:]])
     long = np.flatnonzero(np.diff(ends) > _UNAIDED_S * 1e9)

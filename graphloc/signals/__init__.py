@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a stream tells of itself, before anything is solved: frozen, spiked, jumping, paused, too dense, how noisy."""
+"""What a sensor's data show before anything is solved: freezing, spikes, jumps, pauses, rate and noise."""

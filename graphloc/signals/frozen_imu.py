@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frozen IMU: its driver repeats the last sample again and again while the stamps advance.
+"""A frozen IMU: its driver repeats the last sample while the stamps advance.
 
-Such samples claim standstill or a steady turn, whatever the vessel does. Real noise never repeats bit for bit in all six
-axes for long, nor in the three rates for longer. A simulated IMU without noise does repeat at rest, but then its rates are
-exactly zero: such samples are accepted.
+Such samples claim standstill or a steady turn, whatever the vessel does. Real noise never repeats bit for bit in all
+six axes for long, nor in the three rates for a second. A simulated IMU without noise does repeat at rest, but then its
+rates are exactly zero, and such samples are accepted.
 """
 
 from __future__ import annotations
@@ -17,17 +17,18 @@ from graphloc.signals.series import runs
 from graphloc.time import NS_PER_S, utc_text
 
 LEAST_S, FEWEST = 0.2, 10
-"""Duration (s) and number of repetitions from which a repeated sample counts as frozen. Drivers that publish faster than
-they measure, and quantised readings at rest, repeat for less."""
+"""Duration (s) and number of repetitions from which a repeated sample counts as frozen. Drivers that publish faster
+than they measure, and quantised readings at rest, repeat for less."""
 RATES_LEAST_S, RATES_FEWEST = 1.0, 50
-"""The same for the three rates alone: fewer axes repeat by chance more easily."""
+"""Duration (s) and number of repetitions from which repeated rates alone count as frozen: three axes repeat by chance
+more easily than six."""
 FROZEN_IMU = "frozen: it repeats one sample (or its three rates) bit for bit while the stamps advance; check the sensor and its driver"
 
 
 def frozen_samples(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:
-    """Return (N,) which samples are repetitions of a frozen IMU.
+    """Return a mask (N,) of the samples that a frozen IMU repeats.
 
-    The first sample of each stretch is not one of them: it was measured.
+    The first sample of each stretch is not in it, because it was measured.
 
     Args:
         stamps_ns: (N,), increasing. samples: (N, 6), specific force (m/s^2) and angular rate (rad/s), axes of the IMU.
@@ -41,7 +42,12 @@ def frozen_samples(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.b
 def _repeats(
     stamps_ns: NDArray[np.int64], rows: Array, judged: NDArray[np.bool_], least_s: float, fewest: int
 ) -> NDArray[np.bool_]:
-    """Return (N,) which rows (N, k), of those to be `judged`, repeat the first of a stretch that is long enough."""
+    """Return a mask (N,) of the rows (N, k) that repeat the first row of a long enough stretch of equal ones.
+
+    Args:
+        judged: (N,) rows that may count as repeated.
+        least_s, fewest: duration (s) and number of repetitions from which a stretch is long enough.
+    """
     if len(stamps_ns) == 0:
         return np.zeros(0, dtype=bool)
     first = np.concatenate([[0], np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1])
@@ -53,7 +59,7 @@ def _repeats(
 
 
 def frozen_imu_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> list[str]:
-    """Return a line on what `frozen_samples` found."""
+    """Return a warning on the samples `bad` (N,) that `frozen_samples` found, or none."""
     if not bad.any():
         return []
     where = stretches(stamps_ns, bad)
@@ -63,7 +69,7 @@ def frozen_imu_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[n
 
 
 def stretches(stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> str:
-    """Describe the stretches of `bad` (N,) in words: for how long each lasts, and from when."""
+    """Return in words how many stretches of `bad` (N,) there are, how long they last, and when the longest begins."""
     first, end = runs(bad).T
     lasts_s = (stamps_ns[end - 1] - stamps_ns[first - 1]) / NS_PER_S
     longest = int(np.argmax(lasts_s))
@@ -74,12 +80,12 @@ def stretches(stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> str:
 
 
 def _at_rest(samples: Array) -> NDArray[np.bool_]:
-    """Return (...) whether samples (..., 6) are those of a noise-free IMU at rest: a specific force, and all rates exactly zero."""
+    """Return a mask (...) of samples (..., 6) as of a noise-free IMU at rest: a force, and all rates exactly zero."""
     return np.asarray((samples[..., 3:] == 0.0).all(axis=-1) & (samples[..., :3] != 0.0).any(axis=-1))
 
 
 class FrozenImuDetector:
-    """The same online: repetitions are accepted until the stretch is long enough to be detected."""
+    """Online counterpart of `frozen_samples`: repetitions are accepted until the stretch is long enough."""
 
     def __init__(self) -> None:
         self._all, self._rates = _Stretch(LEAST_S, FEWEST), _Stretch(RATES_LEAST_S, RATES_FEWEST)
@@ -104,7 +110,7 @@ class _Stretch:
         self._row: Array | None = None
 
     def goes_on(self, stamp_ns: int, row: Array) -> bool:
-        """Take in a row; return whether it repeats the first of its stretch, and the stretch is long enough."""
+        """Take in a row; return whether it repeats the first row of its stretch, and the stretch is long enough."""
         if stamp_ns < self._first_ns or self._row is None or (row != self._row).any():
             self._first_ns, self._row, self._repeats = stamp_ns, row, 0
             return False

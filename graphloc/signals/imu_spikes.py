@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Spikes of an IMU: one or two readings that leap away and back, as a disturbed cable or a driver that misreads a byte gives.
+"""Spikes of an IMU: one or two readings that leap away and back, as with a bad cable or a driver that misreads a byte.
 
-Integrated, one rate of 2 rad/s at 100 Hz turns the estimate by 1.1 deg for good, and no noise model expects it. A real knock lasts for
-longer than a spike may (so of an IMU at 40 Hz or less none is judged), or its neighbours are as restless.
+Integrated, one rate of 2 rad/s at 100 Hz turns the estimate by 1.1 deg for good, and no noise model expects it. A real
+knock lasts longer than a spike may, or the samples beside it are as restless. At 40 Hz or less a single sample already
+lasts too long, so nothing is judged.
 """
 
 from __future__ import annotations
@@ -18,20 +19,22 @@ from graphloc.time import NS_PER_S, utc_text
 
 IMU_SPIKE = "a spike: the samples before and after it agree; check cable and driver"
 LONGEST = 2
-"""Number of samples in a row that may be one spike."""
-_LEAST = np.repeat([40.0, 0.5], 3)  # m/s^2, rad/s: what leaps by less does little harm
-# A leap is so many times what most steps from sample to sample are. A spike makes two steps that are more: after four of them among so
-# many samples the next is motion, as of a robot that walks.
+"""Most samples in a row that may be one spike."""
+_LEAST = np.repeat([40.0, 0.5], 3)  # m/s^2, rad/s: a smaller leap does little harm
+# A leap is a step of so many times this quantile of the steps before it. A spike makes two such steps, so after four
+# spikes among `_RECENT` steps the quantile is a leap itself, and the next one counts as motion, as of a robot that
+# walks.
 _TIMES, _QUANTILE = 5.0, 0.97
-_RECENT, _FEWEST = 200, 40  # steps that it is compared with; with fewer nothing is judged
-_CALM = 2  # steps before a leap that are usual: else it rings
-_BACK = 0.25  # of a leap may be left where it has gone back: less than of a knock that rings
-# At most, from the sample before to the one after: knocks of a hull or a wheel last for longer.
+# Most, and fewest, steps before it that a step is compared with; with fewer, nothing is judged.
+_RECENT, _FEWEST = 200, 40
+_CALM = 2  # steps before a leap that must be usual: else the IMU rings
+_BACK = 0.25  # share of a leap that may be left after it has gone back; a knock that rings leaves more
+# Longest time from the sample before a spike to the one after it: knocks of a hull or a wheel last longer.
 _LASTS_NS = NS_PER_S // 22
 
 
 def spikes(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:
-    """Return (N,) which samples are spikes.
+    """Return a mask (N,) of the samples that are spikes.
 
     Args:
         stamps_ns: (N,), increasing. samples: (N, 6), specific force (m/s^2) and angular rate (rad/s), axes of the IMU.
@@ -53,7 +56,7 @@ def spikes(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.bool_]:
 
 
 def spike_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.bool_]) -> list[str]:
-    """Return a line on what `spikes` found."""
+    """Return a warning on the samples `bad` (N,) that `spikes` found, or none."""
     if not bad.any():
         return []
     first = utc_text(int(stamps_ns[np.flatnonzero(bad)[0]]))
@@ -61,7 +64,10 @@ def spike_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray[np.boo
 
 
 def _limit(recent: Array) -> Array:
-    """Return how far (6,) a reading may leap after samples (N, 6); infinity where too few are known, or the last ones leapt."""
+    """Return how far (6,) the next reading after samples (N, 6) may step without being a leap.
+
+    Infinite where there are too few samples, or where the last of them leapt.
+    """
     if len(recent) <= _FEWEST:
         return np.full(6, np.inf)
     steps = np.abs(np.diff(recent, axis=0))
@@ -71,7 +77,7 @@ def _limit(recent: Array) -> Array:
 
 
 def _leaps_back(before: Array, held: Array, after: Array, limit: Array) -> bool:
-    """Return whether samples (N, 6) leap away from the one before, and the one after has gone back, in all axes that leap."""
+    """Return whether samples `held` (N, 6) leap away from `before`, and `after` has gone back in all axes that leap."""
     leap = np.abs(held - before)
     leaping = (leap > limit).any(axis=0)
     back = np.abs(after - before) < _BACK * leap.min(axis=0)
@@ -79,7 +85,7 @@ def _leaps_back(before: Array, held: Array, after: Array, limit: Array) -> bool:
 
 
 class SpikeDetector:
-    """The same online: a sample that leaps is held back until the next ones show whether it was a spike."""
+    """Online counterpart of `spikes`: a sample that leaps is held back until the next ones show what it is."""
 
     def __init__(self) -> None:
         self._recent: deque[Array] = deque(maxlen=_RECENT + 1)
@@ -88,7 +94,7 @@ class SpikeDetector:
 
     @property
     def held_ns(self) -> int:
-        """Stamp of the last sample that is held back; below all stamps where none is."""
+        """Stamp of the last sample that is held back; below all stamps if none is."""
         return self._held[-1][0].stamp_ns if self._held else -(1 << 63)
 
     def take(self, m: ImuSample) -> tuple[list[ImuSample], list[ImuSample]]:
@@ -110,7 +116,7 @@ class SpikeDetector:
         return self._accepted([*self._held, (m, row)]), []
 
     def let_go(self) -> list[ImuSample]:
-        """Return what is held back, and forget all samples."""
+        """Return the samples that are held back, and forget all samples."""
         held = [m for m, _ in self._held]
         self._recent.clear()
         self._held.clear()

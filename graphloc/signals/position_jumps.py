@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Position jumps of a receiver (multipath, wrong RTK fix) where no other sensor measures position: the track follows them.
+"""Position jumps of a receiver (multipath, wrong RTK fix) where no other sensor measures position.
 
-The stated sigma does not show them: a wrong RTK fix is stated to a centimetre as a right one is. They are found in the
-positions themselves, by comparing each step with those before and after it: no vessel changes its acceleration by so much
-at once. Offline those that stand out less are found, too: the IMU keeps a track from following at once, so the fixes are off to one side of
-it before a jump, and to the other one after it.
+The track follows such jumps, and the stated sigma does not show them: a wrong RTK fix is stated to a centimetre, as a
+right one is. They are found in the positions themselves, by comparing each step with those before and after it: no
+vessel changes its acceleration by so much at once. Offline, smaller jumps are found in a solution, too. There the IMU
+keeps the track from following a jump at once, so the fixes lie to one side of the track before the jump, and to the
+other side after it.
 """
 
 from __future__ import annotations
@@ -21,42 +22,44 @@ from graphloc.frames import Array
 from graphloc.time import NS_PER_S, duration_ns, utc_text
 
 LASTS_S = 200.0
-"""For so long (s) before and after a jump either side may be the wrong one: about as long as a slow error lasts."""
-_JUMP_M = 3.0  # at a fix per second: 4 m/s^2 that come and go within three seconds
-_JUMP = 10.0  # times the usual difference between a step and those beside it
-_FEWEST = 10  # fixes that give the latter; in its neighbourhood so many on either side
-_AROUND = 0.75  # share of the local median, which is usually above that of the whole run
-_SIGMAS = 10.0  # stated ones of a fix: less is its noise
-_BRAKES_MPS2 = 10.0  # emergency braking of a car to a stop between two fixes: less is its motion
-_EVEN = 1.5  # steps in time that differ by more than this factor are not compared
+"""Time (s) before and after a jump in which either side may be the wrong one: about as long as a slow error lasts."""
+# Size that counts whatever the stated sigma, at a fix per second: as motion, 4 m/s^2 that come and go within three
+# seconds.
+_JUMP_M = 3.0
+_JUMP = 10.0  # least size, in usual differences between a step and those beside it
+_FEWEST = 10  # fixes that are needed for the usual difference; its neighbourhood has so many on either side
+_AROUND = 0.75  # factor on the median of a neighbourhood, which is usually above that of the whole run
+_SIGMAS = 10.0  # least size in stated sigmas of a fix: less is its noise
+_BRAKES_MPS2 = 10.0  # emergency braking of a car to a stop between two fixes: a smaller difference is motion
+_EVEN = 1.5  # steps that last longer or shorter than usual by more than this factor are not compared
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
-# Off a track the medians of the fixes on either side of a jump are compared.
-_BESIDE_S = 2.0  # of either side
-_FEWEST_BESIDE = 3  # fixes on either side, at least, of which as many lie there: two outliers in a row are no jump
-_SLOW_S = 2.5  # between fixes, from which two on either side are enough: the track follows after these
-_OFF_SIGMAS = 8.0  # of the difference of two medians
-_OFF_M = 1.0  # least difference
-_AT_ONCE = 0.5  # share of it that comes from one fix to the next: where track and fixes part otherwise they do so little by little
-_GAP = 3.0  # times the usual time between fixes
-_KEPT = 200  # so that memory stays bounded: ten seconds of a receiver at 20 Hz; a choice
+# Of `jumps_off_track`, which compares the medians of the fixes on either side of a jump.
+_BESIDE_S = 2.0  # length of either side
+_FEWEST_BESIDE = 3  # fixes on either side, at least, and so many of them off to that side: two outliers are no jump
+_SLOW_S = 2.5  # time between fixes from which two on either side are enough: the track follows after these
+_OFF_SIGMAS = 8.0  # least difference of the two medians, in its sigmas
+_OFF_M = 1.0  # least difference of the two medians
+_AT_ONCE = 0.5  # share of it that must come in one step: for other reasons track and fixes part little by little
+_GAP = 3.0  # a step that lasts so many times the usual one is a gap
+_KEPT = 200  # fixes and jumps kept online, to bound memory: ten seconds of a receiver at 20 Hz; a choice
 _FITS_SIGMAS = 5.0  # off its prediction, up to which the fix before a jump fits
-_CERTAIN_SIGMAS = 8.0  # off its prediction, from which the fix after a jump does not
-_SAME, _SAME_SIGMAS = 0.25, 3.0  # off a prediction by the same: within this share and so many sigmas
-_ENDS = 10.0  # odds that a jump is over
-_IMU_OFF_MPS2 = 1.0  # by how much an IMU may be wrong: gravity where it is tilted by 6 deg
+_CERTAIN_SIGMAS = 8.0  # off its prediction, from which the fix after a jump does not fit
+_SAME, _SAME_SIGMAS = 0.25, 3.0  # fixes are off by the same if they differ by less than this share plus so many sigmas
+_ENDS = 10.0  # odds from which a jump counts as over
+_IMU_OFF_MPS2 = 1.0  # by how much an IMU may be wrong: gravity, where it is tilted by 6 deg
 
 MEAN_S = 30.0
 """Mean duration of a jump, s."""
 
 
 def only_position_sensor(stream: Any, absolute: Collection[Any]) -> bool:
-    """Return whether this stream is the only one that measures position, and may jump.
+    """Return whether a stream is the only one that measures position, and may jump.
 
-    Beside a sensor of velocity, too: its slow error is then estimated, but a window follows a jump that its steps do not allow for,
-    as no other sensor holds the place.
+    That holds also beside a sensor of velocity, where its slow error is estimated: a window still follows a jump that
+    the steps of that error do not allow for, because no other sensor holds the place.
 
     Args:
-        absolute: the absolute streams of the run.
+        absolute: the streams of the run that measure position.
     """
     alone = len(absolute) == 1 and stream.row.absolute and stream.row.false is None
     return bool(alone and (stream.slow is None or stream.left_out is not None or stream.slow.jumps))
@@ -65,30 +68,33 @@ def only_position_sensor(stream: Any, absolute: Collection[Any]) -> bool:
 def position_jumps(
     stamps_ns: NDArray[np.int64], places_m: Array, sigma_m: Array, *, allowed_m: float
 ) -> tuple[NDArray[np.int64], Array]:
-    """Return stamps (K,) and sizes (K,), m, of the position jumps: steps unlike those before and after.
+    """Return stamps (K,), ns, and sizes (K,), m, of the position jumps: steps unlike those before and after.
 
-    A single outlier, or a burst of them, is no jump: the track does not follow it.
+    The stamp is that of the first fix after the jump. A single outlier, or a burst of them, is no jump: the track does
+    not follow it.
 
     Args:
         stamps_ns: (N,), increasing. places_m: (N, 2), in a local level frame. sigma_m: (N,) as stated.
-        allowed_m: jumps that the bounds already include (`build.allowed_jump_m`).
+        allowed_m: size up to which the bounds already include a jump (`build.allowed_jump_m`).
     """
     if len(stamps_ns) < _FEWEST:
         return np.zeros(0, dtype=np.int64), np.zeros(0)
     steps, dt = np.diff(places_m, axis=0), np.diff(stamps_ns) / NS_PER_S
     usual_s = float(np.median(dt))
-    # Stamps of measurement: steps are proportional to time; stamps of arrival: they are not.
+    # Steps are proportional to the time between stamps if these are of the measurements, but not if they are of
+    # arrival.
     by_time = _parts(steps * (usual_s / np.maximum(dt, 1e-9))[:, None])
     parts = _parts(steps)
     off_m = np.minimum(np.linalg.norm(parts, axis=1), np.linalg.norm(by_time, axis=1))
     padded = np.pad(off_m, 1)
-    beside = np.maximum(padded[:-2], padded[2:])  # the steps beside a jump show half of it
-    # Two steps together against those before and after: a single outlier goes there and back.
+    beside = np.maximum(padded[:-2], padded[2:])  # the steps beside a jump differ by half of it
+    # Two steps together against those before and after: an outlier goes there and back, so it disappears in them.
     both = np.linalg.norm(steps[1:-2] + steps[2:-1] - steps[:-3] - steps[3:], axis=1)
     both = np.minimum(np.append(both, np.inf), np.append(np.inf, both))
     window = np.lib.stride_tricks.sliding_window_view
     even = (window(dt, 3).max(axis=1) < _EVEN * usual_s) & (window(dt, 3).min(axis=1) * _EVEN > usual_s)
-    # In a gap the vessel may have gone anywhere; where fixes are seconds apart, any turn or stop differs by metres.
+    # In a gap the vessel may have gone anywhere; where fixes are seconds apart, any turn or stop makes steps differ by
+    # metres.
     believed_m = np.maximum(_BRAKES_MPS2 * usual_s**2 / 2.0, _SIGMAS * window(sigma_m, 4).max(axis=1))
     least_m = np.minimum(_JUMP_M * max(usual_s, 1.0) ** 2, np.maximum(believed_m, allowed_m))
     least_m = np.maximum(least_m, _JUMP * _usual(off_m))
@@ -101,13 +107,13 @@ def position_jumps(
 
 
 def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: float) -> tuple[NDArray[np.int64], Array]:
-    """Return stamps (K,) and sizes (K,), m, of the position jumps that an estimated track does not follow at once.
+    """Return stamps (K,), ns, and sizes (K,), m, of the position jumps that an estimated track does not follow at once.
 
     The medians of some fixes before and after are compared, so that outliers do not count.
 
     Args:
         stamps_ns: (N,), increasing. off_m: (N, 2) fixes less the track.
-        allowed_m: jumps that the bounds already include (`build.allowed_jump_m`).
+        allowed_m: size up to which the bounds already include a jump (`build.allowed_jump_m`).
     """
     dt_s = np.diff(stamps_ns) / NS_PER_S
     usual_s = float(np.median(dt_s)) if len(dt_s) else np.inf
@@ -118,18 +124,19 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
     steps = np.diff(off_m, axis=0)
     windows = np.lib.stride_tricks.sliding_window_view(off_m, n, axis=0)
     medians = np.median(windows, axis=-1)
-    # About each step that has n fixes on either side.
+    # For each step that has n fixes on either side.
     change, between = medians[n:] - medians[:-n], (medians[n:] + medians[:-n]) / 2.0
     size_m, inner = np.linalg.norm(change, axis=1), slice(n - 1, n - 1 + len(change))
     after, before = (
         (np.einsum("kin,ki->kn", own - between[:, :, None], change) * way > 0.0).sum(axis=1)
         for own, way in ((windows[n:], 1.0), (windows[:-n], -1.0))
     )
-    # Standard deviations on one axis: of a fix, by the steps' median length; of a difference of medians.
+    # Sigma of a fix on one axis, by the median length of steps; sqrt(pi / n) times it is that of the difference of
+    # medians.
     sigma_m = float(np.median(np.linalg.norm(steps, axis=1))) / np.sqrt(4.0 * np.log(2.0))
     least_m = max(_OFF_M, allowed_m, _OFF_SIGMAS * sigma_m * np.sqrt(np.pi / n))
     along_m = np.einsum("ni,ni->n", steps[inner], change) / np.maximum(size_m, 1e-9)
-    # Over a gap the track bends, too, where the IMU is worse than it is taken for.
+    # Across a gap the track bends without a jump, too, if the IMU is worse than configured.
     jumps = (size_m > least_m) & (along_m > _AT_ONCE * size_m) & (dt_s[inner] < _GAP * usual_s)
     jumps &= np.minimum(after, before) >= fewest
     left_m, found = np.where(jumps, size_m, 0.0), list[int]()
@@ -141,12 +148,15 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
 
 
 def _parts(steps_m: Array) -> Array:
-    """Return (N - 2, 2) the difference between each inner step (N, 2) and the mean of its neighbours."""
+    """Return the difference (N - 2, 2) between each inner step (N, 2) and the mean of the steps beside it."""
     return np.asarray(steps_m[1:-1] - (steps_m[:-2] + steps_m[2:]) / 2.0)
 
 
 def _usual(off_m: Array) -> Array:
-    """Return (N,) the usual step difference: the median of all, or of the neighbourhood where that is larger (scatter may grow for a while)."""
+    """Return the usual step difference (N,): the median of all, or of the neighbourhood where that is larger.
+
+    The scatter of fixes may grow for a while.
+    """
     around = np.lib.stride_tricks.sliding_window_view(np.pad(off_m, _FEWEST, mode="reflect"), 2 * _FEWEST + 1)
     return np.asarray(np.maximum(np.median(around, axis=1) * _AROUND, np.median(off_m)))
 
@@ -154,9 +164,10 @@ def _usual(off_m: Array) -> Array:
 def jump_warnings(
     sensor: str, stamps_ns: NDArray[np.int64], off_m: Array, *, allowed: bool, followed: bool = True
 ) -> list[str]:
-    """Return a warning on what `position_jumps` found, or none.
+    """Return a warning on the jumps that `position_jumps` found, or none.
 
     Args:
+        stamps_ns, off_m: (K,) stamps and sizes, m. allowed: whether the bounds include them.
         followed: whether the track follows the jumps; else they are attributed to the receiver's slow error.
     """
     if not len(stamps_ns):
@@ -178,7 +189,7 @@ def largest_sigma(cov: Array) -> float:
 
 
 def why_in_doubt(sensor: str) -> str:
-    """Say why the health of a pose near a jump is not good."""
+    """Return the reason why the health of a pose near a position jump is not good."""
     return f"position jump of {sensor}, and no other sensor measures position"
 
 
@@ -187,7 +198,11 @@ def _none() -> tuple[NDArray[np.int64], Array]:
 
 
 class PositionJump(NamedTuple):
-    """A jump: the stamp (ns) of the first fix after it, and by how much it is off those before, east and north (m)."""
+    """A position jump.
+
+    Attributes:
+        after_ns: stamp of the first fix after it. east_m, north_m: the positions after it less those before.
+    """
 
     after_ns: int
     east_m: float
@@ -195,12 +210,17 @@ class PositionJump(NamedTuple):
 
     @property
     def size_m(self) -> float:
-        """Its length, m."""
+        """Length of the jump, m."""
         return math.hypot(self.east_m, self.north_m)
 
 
 class OffPrediction(NamedTuple):
-    """By how much (2,), m, a fix is off its prediction, how many sigmas that is, and how many it would be were the slow error over."""
+    """A fix against its prediction.
+
+    Attributes:
+        off_m: (2,) fix less prediction. sigmas: size of that in sigmas.
+        sigmas_without: the same against the prediction without the slow error, as if that were over.
+    """
 
     off_m: Array
     sigmas: float
@@ -208,13 +228,14 @@ class OffPrediction(NamedTuple):
 
 
 class JumpDetector:
-    """The same for one receiver online: a jump is detected a second later, from its fixes, or by what the IMU predicts.
+    """Finds the position jumps of one receiver online, about a second late, by its fixes or by what the IMU predicts.
 
-    The fixes alone do not show a jump among steps of its size: noise, or a vessel that goes metres between two of them. What is
-    off the prediction by the same for a second has jumped: that of an IMU which is wrong grows.
+    The fixes alone do not show a jump among steps of its size: noise, or a vessel that goes metres between two fixes. A
+    receiver that is off its prediction by the same vector for a second has jumped; the error of an IMU that is wrong
+    would grow.
 
     Attributes:
-        jumps: the last of those detected since the estimate started.
+        jumps: the last of the jumps found since the estimate started.
     """
 
     def __init__(self) -> None:
@@ -222,28 +243,34 @@ class JumpDetector:
         self._seen: deque[tuple[int, Array, float]] = deque(maxlen=_KEPT)
         self._judged_ns = 0
         self._last_ns: int | None = None
-        self._before: tuple[int, OffPrediction] | None = None  # the last fix
-        self._off: list[tuple[int, Array]] = []  # the fixes since the beginning of what may be a jump
+        self._before: tuple[int, OffPrediction] | None = None  # of the last fix
+        self._off: list[tuple[int, Array]] = []  # of the fixes since a suspected jump began
 
     def suspects(self, stamp_ns: int) -> bool:
-        """Return whether a fix may be of a jump, or of a burst of outliers, that has begun: which one shows within seconds.
+        """Return whether a fix belongs to a suspected jump, or a burst of outliers: within seconds it is known.
 
-        Those before it are none, though they come late, or once more as the window is rebuilt.
+        Fixes from before it do not belong to it, even if they come late, or once more as the window is rebuilt.
         """
         return bool(self._off) and stamp_ns >= self._off[0][0]
 
     def forget(self) -> None:
-        """Forget the jumps, and what may be one: it was off an estimate that is given up."""
+        """Forget the jumps, found and suspected: the estimate that they are off is given up."""
         self.jumps, self._off, self._before = (), [], None
 
     def let_go(self) -> None:
-        """Forget what may be a jump: another sensor measures position now, and shows which it is; nor is one looked for among those fixes later."""
+        """Forget a suspected jump, because another sensor measures position now, and shows what is right.
+
+        Nor are jumps looked for later among the fixes so far.
+        """
         self._off, self._before = [], None
         if self._seen:
             self._judged_ns = max(self._judged_ns, self._seen[-1][0])
 
     def forget_since(self, stamp_ns: int) -> None:
-        """Forget the fixes since a stamp, and the jumps found in them: they are none of a receiver that goes along."""
+        """Forget the fixes since a stamp, and the jumps found in them.
+
+        The receiver was frozen since then, or the IMU that predicted them was wrong, so they may be none.
+        """
         self._seen = deque((kept for kept in self._seen if kept[0] < stamp_ns), maxlen=_KEPT)
         self.jumps = tuple(jump for jump in self.jumps if jump.after_ns < stamp_ns)
         if self._last_ns is not None and self._last_ns >= stamp_ns:
@@ -253,10 +280,13 @@ class JumpDetector:
     def note(
         self, stamp_ns: int, place_m: Array, sigma_m: float, *, allowed_m: float, off: OffPrediction | None = None
     ) -> tuple[NDArray[np.int64], Array]:
-        """Take in a fix; ignore a late one. Return new jumps as `position_jumps` does; while in doubt, no further ones.
+        """Take in a fix, unless it is late, and return new jumps as `position_jumps` does.
+
+        While an earlier jump leaves the position in doubt, no further ones are returned.
 
         Args:
-            off: how it lies to its prediction; None: nothing predicts it.
+            place_m: (2,) in a local level frame. sigma_m: as stated. allowed_m: as of `position_jumps`.
+            off: the fix against its prediction; None: nothing predicts it.
         """
         if self._seen and stamp_ns <= self._seen[-1][0]:
             return _none()
@@ -267,7 +297,10 @@ class JumpDetector:
     def _by_prediction(
         self, stamp_ns: int, off: OffPrediction | None, sigma_m: float, allowed_m: float
     ) -> PositionJump | None:
-        """Return a jump that is certain by now: at once, fixes were off their predictions, and have been by the same for a second."""
+        """Return a jump that is certain by now, or None.
+
+        The fixes went off their predictions at once, and have been off by the same vector for a second.
+        """
         before, self._before = self._before, None if off is None else (stamp_ns, off)
         if off is None or before is None:
             self._off = []
@@ -276,22 +309,25 @@ class JumpDetector:
         if self._off:
             mean_m = np.mean([m for _, m in self._off], axis=0)
             most_m = _SAME * float(np.linalg.norm(mean_m)) + _SAME_SIGMAS * sigma_m
-            # By the larger sigma of a fix alone, those that fit would be off by the same as an outlier across it.
+            # A fix nearer to its prediction than to the mean is not off by the same, however large its sigma.
             if float(np.linalg.norm(off_m - mean_m)) > min(most_m, float(np.linalg.norm(off_m))):
                 self._off = []
-        # No IMU is wrong by just what the slow error is. The odds that it is over: of the fix, and of a jump to end in this time. The
-        # latter are even at most: where no jump is going on, or the prediction tells nothing, a silence does not end one.
+        # A jump back is off by just the slow error, which no wrong IMU is. Its odds are those of the fix, times those
+        # of a jump to end in this time. The latter are even at most: if no jump is going on, or the prediction tells
+        # nothing, a silence ends none.
         odds = math.expm1(min(dt_s / MEAN_S, math.log(2.0)))
         ends = off.sigmas**2 - off.sigmas_without**2 > 2.0 * (math.log(_ENDS) - math.log(odds))
         least_m = max(allowed_m, _JUMP_M, _IMU_OFF_MPS2 * dt_s**2 / 2.0)
-        # After a fix that was off and used, the estimate is on its way there, and a right one is off, too.
+        # A fix that was off but used pulls the estimate along, so that a right fix after it is off, too: so the fix
+        # before must fit.
         jumps = before[1].sigmas < _FITS_SIGMAS and off.sigmas > _CERTAIN_SIGMAS and np.linalg.norm(off_m) > least_m
         if self._off or ends or jumps:
             self._off.append((stamp_ns, off_m))
         if not self._off or stamp_ns - self._off[0][0] < _BURST_S * NS_PER_S:
             return None
         begun_ns, jump_m = self._off[0][0], np.mean([m for _, m in self._off], axis=0)
-        self._off, self._before = [], (stamp_ns, OffPrediction(off_m - jump_m, 0.0, 0.0))  # from now on it is predicted
+        # From now on the jump is part of the prediction.
+        self._off, self._before = [], (stamp_ns, OffPrediction(off_m - jump_m, 0.0, 0.0))
         return PositionJump(begun_ns, *jump_m.tolist())
 
     def _by_steps(self, stamp_ns: int, allowed_m: float) -> tuple[NDArray[np.int64], Array]:
@@ -300,7 +336,7 @@ class JumpDetector:
         stamps_ns, sigmas_m = np.array([at for at, _, _ in self._seen]), np.array([s for _, _, s in self._seen])
         places_m = np.array([p for _, p, _ in self._seen])
         at_ns, _ = position_jumps(stamps_ns, places_m, sigmas_m, allowed_m=allowed_m)
-        until_ns = min(stamps_ns[-3], stamp_ns - duration_ns(_BURST_S))  # a later one may yet be a burst
+        until_ns = min(stamps_ns[-3], stamp_ns - duration_ns(_BURST_S))  # a later jump may turn out to be a burst
         new = (at_ns > self._judged_ns) & (at_ns <= until_ns)
         self._judged_ns = max(int(until_ns), self._judged_ns)
         known_ns = [jump.after_ns for jump in self.jumps]
@@ -319,11 +355,16 @@ class JumpDetector:
         return np.array([jump.after_ns for jump in jumps], dtype=np.int64), np.array([jump.size_m for jump in jumps])
 
     def drawn_anew(self, stamp_ns: int) -> None:
-        """Take in that the receiver's error is drawn anew at a stamp: which level before was right no longer matters."""
+        """Note that the slow error is drawn anew at a stamp: which level was right before no longer matters."""
         if self._last_ns is not None and self._last_ns < stamp_ns:
             self._last_ns = None
 
     def doubtful(self, stamp_ns: int, settled_ns: int = 0) -> bool:
-        """Return whether there was a jump within the last `LASTS_S`, and after a stamp at which the place was known without this receiver."""
+        """Return whether a jump leaves the position in doubt at a stamp: it came within the last `LASTS_S`.
+
+        Args:
+            settled_ns: stamp at which the position was last known without this receiver: a jump before it leaves no
+                doubt.
+        """
         last_ns = self._last_ns
         return last_ns is not None and last_ns > settled_ns and 0 <= stamp_ns - last_ns < LASTS_S * NS_PER_S

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Columns of numbers over time: between their stamps, summed up, how large, how scattered, and where in a row."""
+"""Columns of numbers over time: interpolation, integrals, line fits, size and scatter, and runs in a mask."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graphloc.frames import Array
 
 
 def interpolated(t: NDArray[Any], at: NDArray[Any], columns: Array) -> Array:
-    """Return columns (N, k), known at times `at` (N,), at times `t` (M,): linear in between, constant beyond the ends."""
+    """Return columns (N, k), known at times `at` (N,), at times `t` (M,): linear between, constant beyond the ends."""
     return np.column_stack([np.interp(t, at, column) for column in columns.T])
 
 
@@ -37,7 +37,7 @@ class LineFit(NamedTuple):
 def line_fit(t_s: Array, values: Array) -> LineFit:
     """Return the straight line through values (N, k) at times (N,)."""
     dt, around = t_s - t_s.mean(), values - values.mean(axis=0)
-    square = max(float(dt @ dt), 1e-9)  # all at one time: a slope that tells nothing
+    square = max(float(dt @ dt), 1e-9)  # if all times are equal, the slope tells nothing
     slope = dt @ around / square
     return LineFit(slope, around - np.outer(dt, slope), 1.0 / float(np.sqrt(square)))
 
@@ -48,10 +48,13 @@ def rms(values: Array) -> float:
 
 
 def robust_sigma(off: NDArray[Any]) -> Array:
-    """Return the sigma (...) of values (N, ...) about zero by their median size, as of a normal: outliers hardly change it."""
+    """Return the sigma (...) of values (N, ...) about zero, from their median size as for a normal distribution.
+
+    Outliers hardly change it.
+    """
     return np.asarray(1.4826 * np.median(np.abs(off), axis=0))
 
 
 def runs(there: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return (K, 2) where values (N,) are true in a row: the first index of each run, and the one after its last."""
+    """Return the runs (K, 2) of true values in a mask (N,): the first index of each, and the one after its last."""
     return np.flatnonzero(np.diff(there, prepend=False, append=False)).reshape(-1, 2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""White noise of a signal that moves smoothly: of inertial samples, of places."""
+"""White noise of a signal that varies smoothly, such as inertial samples or positions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def white_noise(columns: Array) -> Array:
 def white_noise_of_thirds(thirds: Array) -> Array:
     """Return the white noise (k,), 1 sigma, from third differences (N, k).
 
-    They hold nothing of a constant acceleration; those of white noise have 1 + 9 + 9 + 1 times its variance. Their median is that of
-    most of them, whatever jumps among the others.
+    A constant acceleration has no part in them; white noise gives them 1 + 9 + 9 + 1 times its variance. Their median
+    is hardly changed by a few that jump.
     """
     return np.asarray(robust_sigma(thirds) / np.sqrt(20.0))

@@ -28,7 +28,7 @@ from graphloc.solve.wrong_imu import ImuWrong, left_out
 __all__ = ["smooth"]
 
 _T = TypeVar("_T")
-_MOST_TIMES = 2  # that spans in which the IMU is wrong are looked for, each without those before
+_MOST_TIMES = 2  # most searches for spans in which the IMU is wrong, each without the spans found before
 _STACK_BYTES = 1 << 29  # address space, not memory: pages are taken when touched
 
 
@@ -47,7 +47,7 @@ def smooth(
     Args:
         recording: what was measured. config: the vessel. datum: origin of world.
         rows, inertial: the table of sensors (`graphloc.factors`).
-        probe: offsets of sensors to look at (`Solution.offsets`); by default none.
+        probe: offsets of sensors to examine (`Solution.offsets`); by default none.
         progress: called with stage, done, total; an exception raised in it cancels cleanly.
 
     Raises:
@@ -81,7 +81,7 @@ def smooth(
 
 
 def _with_offsets(solution: Solution, result: BatchResult, probe: Probe) -> Solution:
-    """The solution, with what it says of its sensors' offsets: an aid, so where that fails the solution stands."""
+    """Return the solution with what the run says of its sensors' offsets; where that fails, with a warning instead."""
     try:
         return replace(solution, offsets=offsets_of(result, probe))
     except (RuntimeError, np.linalg.LinAlgError, MemoryError) as error:
@@ -90,7 +90,10 @@ def _with_offsets(solution: Solution, result: BatchResult, probe: Probe) -> Solu
 
 
 def _on_deep_stack(work: Callable[[], _T]) -> _T:
-    """Call `work` in a thread of its own: GTSAM recurses along the run, and two hours overflow the usual 8 MiB."""
+    """Return what `work` returns, called in a thread with a deep stack.
+
+    GTSAM recurses along the run, and two hours overflow the usual 8 MiB.
+    """
     done: list[_T] = []
     failed: list[BaseException] = []
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Other choices of modes and weights than those that the estimate confirms.
 
-A choice confirms itself, because the estimate follows it. Three others are tried here: the most probable chain of measurements
-that agree with each other; each stretch judged by a solution without its own measurements; and without those believed at the
-ends.
+A choice confirms itself, because the estimate follows it. Three others are tried here: the most probable chain of
+measurements that agree with each other; each stretch judged by a solution without its own measurements; and the
+verdicts without the measurements that are believed at either end.
 """
 
 from __future__ import annotations
@@ -33,29 +33,33 @@ from graphloc.solve.decide import (
 from graphloc.solve.stretch import copy_states, solve_until_written_there, update_states, weak_prior
 from graphloc.time import duration_ns
 
-# A stretch whose hypotheses are judged by the rest of the run: longer than false answers tend to stay,
-# short enough to dead-reckon through.
+# Length of a stretch whose hypotheses are judged by the rest of the run, and the share of a stretch on either side that
+# is left out as well: longer than false answers tend to stay, short enough to dead-reckon through.
 _STRETCH_S, _STRETCH_MARGIN = 8.0, 0.5
-_SURE = 0.7  # a hypothesis judged by the rest alone is believed from here on
-# Surroundings on which another choice of hypotheses is tried.
+_SURE = 0.7  # probability from which a hypothesis that is judged by the rest alone is believed
+# Surroundings, on either side, in which another choice of hypotheses is tried.
 _AROUND_S = 20.0
-_AROUND_PASSES = 6  # at most; they end where choices and places settle. A choice, as many as of a level (`_levels`)
+# Most passes there; they end earlier if choices and places settle. A choice: as many as for a level (`_levels`).
+_AROUND_PASSES = 6
 
 
 def other_choices(
     problem: Problem, few: Thinned, settled: Settled, prior: StartPrior
 ) -> Iterator[tuple[Verdicts, int]]:
-    """Yield each of the three, with the iterations it took, from `settled` as it is by then."""
+    """Yield each of the three other choices, and the iterations that it took.
+
+    Each is made from `settled` as it is by then: the caller may have taken the choices before.
+    """
     yield along_best_chains(problem, settled.values, settled.verdicts), 0
     yield _judged_by_the_rest(few, settled, prior)
     yield _without_its_ends(problem, settled), 0
 
 
 def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tuple[Verdicts, int]:
-    """Weigh each stretch's hypotheses by the solution of the thinned run without them and their neighbours.
+    """Return verdicts on each stretch's hypotheses by the thinned run without them and their neighbours.
 
-    A hypothesis that took part in the estimate supports itself, so a wrong choice would be confirmed. Every third stretch is judged
-    at once, so three solutions are enough for the whole run.
+    The iterations are returned, too. A hypothesis that took part in the estimate supports itself, so a wrong choice
+    would be confirmed. Every third stretch is judged at once, so three solutions are enough for the whole run.
     """
     problem, values = few.problem, few.of(settled.values)
     start_ns, streams = int(problem.timeline.stamps_ns[0]), {s.number: s for s in problem.streams}
@@ -85,7 +89,7 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
         )
         for (number, i), verdict in fresh.items():
             key, stream = (number, int(few.chosen[number][i])), streams[number]
-            at = judged[key].at  # of the whole run
+            at = judged[key].at  # the attachment in the whole run
             residual = stream.row.residuals(stream.measurements[i], stream.config, at)[verdict.mode]
             judged[key] = _decisive(replace(verdict, at=at, residual=residual))
         iterations += 1
@@ -93,7 +97,7 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
 
 
 def _without_its_ends(problem: Problem, settled: Settled) -> Verdicts:
-    """Reject what is believed at either end of a sensor's measurements, where others near by are rejected.
+    """Return verdicts that reject what is believed at an end of a sensor's data, where others near it are rejected.
 
     At an end, evidence against a few false measurements that agree comes from one side only.
     """
@@ -115,22 +119,29 @@ def _without_its_ends(problem: Problem, settled: Settled) -> Verdicts:
 def without(
     problem: Problem, estimate: gtsam.Values, decided: Decisions, prior: StartPrior, left_out: set[tuple[int, int]]
 ) -> Marginals:
-    """Take one step of the whole run without some measurements."""
+    """Return what a run without some measurements says, by one full step from an estimate.
+
+    Args:
+        decided: decisions on all measurements. left_out: (stream number, measurement index) of those to leave out.
+    """
     kept = {key: found for key, found in decided.items() if key not in left_out}
     return marginals(*build_graph(problem, estimate, kept, 0, len(problem.timeline) - 1, prior))
 
 
 def _decisive(verdict: Verdict) -> Verdict:
-    """Round weights to 0 or 1: half a weight for each of several that repeat each other would pull the estimate to them."""
+    """Return the verdict with its weight rounded to 0 or 1.
+
+    Half a weight for each of several measurements that repeat each other would pull the estimate to them.
+    """
     sure = verdict.weight > _SURE
     return replace(verdict, decision=Decision(mode=verdict.mode) if sure else None, weight=float(sure))
 
 
 def take_more_probable(problem: Problem, settled: Settled, others: Verdicts, prior: StartPrior) -> bool:
-    """Take the choices of `others` into `settled`, in place, wherever they are more probable; tell whether any were.
+    """Take the choices of `others` into `settled`, in place, wherever they are more probable; return whether any were.
 
-    Choices that differ are taken together while they are near in time, and each such group is tried on its
-    own surroundings, so that one bad guess does not cost the good ones, and a long run costs no more.
+    Choices that differ are taken together while they are near in time, and each such group is tried on its own
+    surroundings, so that one bad guess does not cost the good ones, and a long run costs no more.
     """
     taken = False
     for group in _groups(problem, settled.verdicts, others):
@@ -151,7 +162,7 @@ def take_more_probable(problem: Problem, settled: Settled, others: Verdicts, pri
 
 
 def _groups(problem: Problem, some: Verdicts, others: Verdicts) -> list[list[tuple[int, int]]]:
-    """Return the measurements that are believed in one and not in the other, split where they are far apart in time."""
+    """Return the measurements that one set of verdicts believes and the other not, in groups that are near in time."""
     stamps = problem.timeline.stamps_ns
     differ = sorted(
         (key for key, v in some.items() if abs(others[key].weight - v.weight) > 0.5),
@@ -193,7 +204,7 @@ def _solve_around(
     prior: StartPrior,
     unlike: Verdicts | None = None,
 ) -> _Around | None:
-    """Solve a stretch until its choices no longer change; None where they become those of `unlike`."""
+    """Return a stretch solved until its choices no longer change; None where they become those of `unlike`."""
     local = copy_states(problem, values, max(first - 1, 0), min(last + 1, len(problem.timeline) - 1))
     for _ in range(_AROUND_PASSES):
         step = solve_until_written_there(problem, local, first, last, prior, decisions(verdicts), tol=1e-3)
@@ -209,5 +220,5 @@ def _solve_around(
 
 
 def _alike(one: Verdict, other: Verdict) -> bool:
-    """Whether both believe the measurement, in the same mode, or neither does."""
+    """Return whether two verdicts both believe the measurement, in the same mode, or both do not believe it."""
     return abs(one.weight - other.weight) < 0.5 and (one.mode == other.mode or one.weight < 0.5)

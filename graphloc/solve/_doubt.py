@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What it adds to the covariance of position and heading that the measurements which determine them may be false together.
+"""How much wider position and heading get because the measurements that determine them may be false together.
 
-A solved graph is as sure as if its choice of modes were right, and the estimate that follows it confirms it. Where errors are
-independent, neighbours show whether it is. Where those of a sensor repeat (matches that take the same moored boats for others), its
-measurements are right or wrong together, however many there are. So each is judged by the run without those whose error may be the
-same. If these are false, the vessel is where that run has it, or as far off as false ones are.
+A solved graph is as sure as if its choice of modes were right, and the estimate, which follows that choice, confirms
+it. Where errors are independent, neighbouring measurements show whether it is right. Where the errors of a sensor
+repeat (matches that take the same moored boats for others), its measurements are right or wrong together, however many
+there are. So each is judged by the run without the measurements whose error may be the same. If these are false, the
+vessel is where that run has it, or as far off as false measurements are.
 """
 
 from __future__ import annotations
@@ -33,24 +34,26 @@ from graphloc.solve.hypotheses import log_right_and_false
 from graphloc.solve.prediction import taken_of
 from graphloc.time import stamps_of
 
-_SLIGHT = 0.005  # a probability that widens bounds by 3 % at most
-_SAID = 0.05  # beyond this one a bound that holds for 95 % depends on what else is possible
-_LONG = 0.1  # share of a run, from which that is said
-_BEYOND = 0.05  # share of the cases that a bound leaves out
-_BOUND = -float(special.ndtri(0.5 * _BEYOND))  # sigmas
-_HALVINGS = 40  # of the interval that holds the bound: to 1e-12 of it
-_STRETCH = 4.0  # lengths of correlation: half of it is kept away from, and errors are 0.14 alike there
+_SLIGHT = 0.005  # probability that is neglected: it widens bounds by 3 % at most
+_SAID = 0.05  # probability beyond which a 95 % bound depends on what else is possible
+_LONG = 0.1  # share of a run with such a probability, from which a warning says so
+_BEYOND = 0.05  # share of the cases that a bound does not hold
+_BOUND = -float(special.ndtri(0.5 * _BEYOND))  # half-width of the bound, sigmas
+_HALVINGS = 40  # of the interval in which a bound is searched: to 1e-12 of it
+# In correlation lengths: half a stretch is left out on either side, beyond which errors correlate by 0.14.
+_STRETCH = 4.0
 _PLANE = np.array([0, 1, 5])  # x, y and yaw in a covariance
-# Which of these three; a row of boats leaves the one open and not the other.
+# Which of x, y and yaw an aspect is; a row of moored boats leaves the position open, but not the heading.
 _ASPECTS = {"position": slice(0, 2), "heading": slice(2, 3)}
 
 
 class Doubt(NamedTuple):
-    """How far those of a sensor's measurements that are believed may be false together, in one aspect.
+    """The probability that the believed measurements of a sensor are false together, in one aspect.
 
     Attributes:
-        stamps_ns: (M,) of its measurements. probability: (M,) that the ones which determine the aspect there are false.
-        spread: variance of their error, if they are, m^2 or rad^2.
+        stamps_ns: (M,) of its measurements.
+        probability: (M,) that the measurements which determine the aspect there are false.
+        spread: variance of their error, if they are false, m^2 or rad^2.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -59,10 +62,11 @@ class Doubt(NamedTuple):
 
 
 class _Apart(NamedTuple):
-    """A run, each state and measurement by the rest of it, without the measurements whose error may be the same.
+    """What a run says of its states and of a sensor's measurements without those whose error may be the same.
 
     Attributes:
-        planes: (N, 3) x, y and yaw of its states. cov: (N, 3, 3). false: (M,) probability that each measurement is false, by aspect.
+        planes: (N, 3) x, y and yaw of the states. cov: (N, 3, 3) of `planes`.
+        false: by aspect, (M,) probability that each measurement is false.
     """
 
     planes: Array
@@ -71,13 +75,16 @@ class _Apart(NamedTuple):
 
 
 def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
-    """Widen horizontal position and heading in covariances (N, 6, 6), in axes of world and in place, by what is left open.
+    """Widen horizontal position and heading in covariances (N, 6, 6) by the doubt about sensors, in place.
+
+    Args:
+        cov: in axes of world.
 
     Returns:
         Warnings.
 
     Raises:
-        SolveError: what the run knows without a sensor in doubt is not determined.
+        SolveError: without the measurements of a sensor in doubt, the run is not determined.
     """
     if not any(map(_shares_errors, result.problem.streams)):
         return []
@@ -103,13 +110,18 @@ def widen_by_doubt(result: BatchResult, cov: Array) -> list[str]:
             axes = _ASPECTS[aspect]
             there = (slice(None), _PLANE[axes][:, None], _PLANE[axes])
             turn = widening(cov[there], more[:, axes, axes], off[:, axes], doubt.spread, probability)
-            # What position and heading have in common stays: in the other case the arm between them is the same (see `widen_heading`).
+            # The covariance between position and heading stays: in the other case the arm between them is the same (see
+            # `widen_heading`).
             cov[there] = turn @ cov[there] @ turn.transpose(0, 2, 1)
     return warnings
 
 
 def ambiguity(sensor: str, aspect: str, probability: Array) -> list[str]:
-    """Say so where bounds depend on the probability (N,), over the states of a run, that what is believed is false."""
+    """Return a warning where bounds depend on what is believed being false, or none.
+
+    Args:
+        probability: (N,) that it is false, by state of a run.
+    """
     open_still = probability[probability > _SAID]
     if (share := len(open_still) / len(probability)) < _LONG:
         return []
@@ -120,33 +132,43 @@ def ambiguity(sensor: str, aspect: str, probability: Array) -> list[str]:
 
 
 def _shares_errors(stream: Stream) -> bool:
-    """Whether a sensor's measurements can be false, and some are by the error of the one before them."""
+    """Return whether a sensor's measurements can be false, and some may share the error of the one before them."""
     return stream.row.false is not None and any(model.news < 1.0 for model in _judged(stream)[1])
 
 
 def _judged(stream: Stream) -> tuple[list[Measurement], list[FalseModel]]:
-    """Return all that a sensor measured, and the error model of each."""
+    """Return all measurements of a sensor, and the model of each one's error if it is false."""
     return taken_of(stream, range(len(stream.measurements)))
 
 
 def parts_of(news: Array) -> Array:
-    """Return where each of M measurements is along the way, in stretches: errors of two that are half a stretch apart are independent."""
+    """Return how far along the run (M,) each measurement is, in stretches.
+
+    The errors of two that are half a stretch apart count as independent.
+
+    Args:
+        news: (M,) as of `FalseModel`.
+    """
     way = -np.log(np.maximum(_kept(news), np.exp(-_STRETCH)))
     way[:1] = 0.0
     return np.asarray(np.cumsum(way) / _STRETCH)
 
 
 def _kept(news: Array) -> Array:
-    """Return the correlation (M,) of the error of each measurement with that of the one before."""
+    """Return the correlation (M,) of the error of each measurement with that of the one before it."""
     return (1.0 - news) / (1.0 + news)
 
 
 def _judged_apart(
     few: Thinned, stream: Stream, result: BatchResult, values: gtsam.Values, decided: Decisions
 ) -> _Apart:
-    """Judge all that a sensor measured by the run without those of its measurements whose error may be the same.
+    """Return what the run says without the measurements of a sensor whose error may be the same.
 
-    Every third stretch of the way is judged at once, without itself and half of its neighbours: three solutions for the whole run.
+    Every third stretch is judged at once, without itself and the nearer halves of its neighbours, so three solutions
+    are enough for the whole run.
+
+    Args:
+        few: the thinned run. values, decided: its estimate and decisions.
     """
     states, (_, models) = range(len(few.states)), _judged(stream)
     along = parts_of(np.array([model.news for model in models]))
@@ -171,7 +193,7 @@ def _judged_apart(
 
 
 def _doubts_of(stream: Stream, result: BatchResult, apart: _Apart) -> dict[str, Doubt]:
-    """Return the doubt about a sensor in each aspect that the believed measurements say."""
+    """Return the doubt about a sensor, for each aspect that its believed measurements determine."""
     measured, models = _judged(stream)
     verdicts = [result.verdicts[stream.number, i] for i in range(len(measured))]
     by_planes, stamps_ns = [_by_plane(v.residual, v.at) for v in verdicts], stamps_of(measured)
@@ -194,8 +216,8 @@ def probability_false(
     """Return the probability that neither the chosen mode of a measurement nor one at the same place is right.
 
     Args:
-        modes: residuals at a prediction of covariance P (k, k). by_plane: as of `_by_plane`. axes: those in which it is the same place,
-            as far as the noise of both explains the distance.
+        modes: residuals at a prediction of covariance P (k, k). chosen: which of them. by_plane: as of `_by_plane`.
+        axes: those of x, y and yaw in which a mode is at the same place, if the noise of both explains the distance.
     """
     right, here = np.array([r.log_density(P) for r in modes]), modes[chosen]
     alike = []
@@ -215,10 +237,11 @@ def doubt_of(
     verdicts: Sequence[Verdict],
     by_aspect: Sequence[Array],
 ) -> Doubt | None:
-    """Return the doubt about M measurements of a sensor; None where none of the believed ones says anything of the aspect.
+    """Return the doubt about M measurements of a sensor; None if no believed one says anything of the aspect.
 
-    It is the mean of `false` (M,), the probability of each, over those whose error is likely the same, each counted by what it
-    says of the aspect. What is news to the measurement before and to the one after is confirmed, or not, by them.
+    Its probability is the mean of `false` (M,), the probability of each, over measurements whose error is likely the
+    same, each weighted by its information on the aspect. A measurement whose error is independent of the one before and
+    of the one after counts as right: these confirm it, or not.
 
     Args:
         by_aspect: Jacobians (k, 2) by the position, 1/m, or (k, 1) by the heading.
@@ -229,7 +252,7 @@ def doubt_of(
     if not says.any():
         return None
     kept = _kept(news)
-    # The first one is all news, and weighs most: those after it may be false with it.
+    # The first measurement of a place is all news, and weighs most; still, those after it may be false with it.
     shared = 1.0 - np.minimum(news, np.append(news[1:], 1.0))
     around = np.maximum(_summed(says, kept), np.finfo(float).tiny)
     probability = _summed(says * false * shared, kept) / around
@@ -238,12 +261,16 @@ def doubt_of(
 
 
 def _information(J: Array, cov: Array) -> float:
-    """Return what a residual of covariance (k, k) says along the axis that it knows best, given its Jacobian (k, d)."""
+    """Return the information of a residual of covariance (k, k) on the axis that it knows best, by Jacobian (k, d)."""
     return float(np.linalg.norm(gauss.whitening(cov) @ J, 2) ** 2)
 
 
 def _summed(values: Array, kept: Array) -> Array:
-    """Return for each of M values the sum over all, weighted by their correlations: products of `kept` (M,) between neighbours."""
+    """Return, for each of M values, the sum of all, weighted by their correlations with it.
+
+    Args:
+        kept: (M,) correlation of each with the one before; that of two others is the product in between.
+    """
     ahead, back = values.copy(), values.copy()
     for n in range(1, len(values)):
         ahead[n] += kept[n] * ahead[n - 1]
@@ -252,31 +279,35 @@ def _summed(values: Array, kept: Array) -> Array:
 
 
 def _planes(few: Thinned, values: gtsam.Values) -> Array:
-    """Return x, y and yaw (N, 3) of the body in a thinned run."""
+    """Return x, y and yaw (N, 3) of the body in the states of a thinned run."""
     lever_m = -few.problem.t_body_imu_m
     poses = [values.atPose3(keys.pose(k)) for k in range(len(few.states))]
     return np.array([[*pose.transformFrom(lever_m)[:2], pose.rotation().yaw()] for pose in poses])
 
 
 def _plane_covariance(few: Thinned, known: Mapping[int, Array], values: gtsam.Values, k: int) -> Array:
-    """Return the covariance (3, 3) of that in state k."""
+    """Return the covariance (3, 3) of x, y and yaw of the body in state k."""
     R = values.atPose3(keys.pose(k)).rotation().matrix()
     found = world_covariance(known[keys.pose(k)], R, -few.problem.t_body_imu_m)
     return np.asarray(found[np.ix_(_PLANE, _PLANE)])
 
 
 def widening(cov: Array, more: Array, off: Array, spread: float, probability: Array) -> Array:
-    """Return the maps (N, d, d) that widen covariances (N, d, d) so that bounds of 95 % hold in both cases together, per axis.
+    """Return the maps (N, d, d) that widen covariances (N, d, d), per axis, so that 95 % bounds hold for a mixture.
+
+    The mixture is of the run as solved and of the other case, in which believed measurements are false.
 
     Args:
-        more: (N, d, d) by how much the covariance is larger in the other case. off: (N, d) how far off its mean is. Both are limited
-            by `spread`, the variance of the distance between the two cases. probability: (N,) of the other case.
+        cov: (N, d, d) as solved. more: (N, d, d) by how much the covariance is larger in the other case.
+        off: (N, d) by how much its mean is off. Both are limited by `spread`, the variance of the distance between the
+            cases.
+        probability: (N,) of the other case.
     """
     eye = np.eye(cov.shape[1])
     size, axes = np.linalg.eigh(more)
     other = cov + (axes * np.maximum(size, 0.0)[:, None]) @ axes.transpose(0, 2, 1)
     near = cov + spread * eye
-    share = near @ np.linalg.inv(near + other)  # of the other case, between it and what is near the first one
+    share = near @ np.linalg.inv(near + other)  # gain that pulls the other case near to the first one
     other = share @ other
     root = np.linalg.cholesky(cov)
     back = np.linalg.inv(root)
@@ -287,10 +318,10 @@ def widening(cov: Array, more: Array, off: Array, spread: float, probability: Ar
 
 
 def _scale(times: Array, off: Array, probability: Array) -> Array:
-    """Return by how much a sigma of 1 is to be raised so that 95 % of a mixture are within its bounds.
+    """Return the factor on a sigma of 1 at which 95 % of a mixture of two normal distributions are within the bounds.
 
     Args:
-        times: (N, d) sigma of the other normal, at least 1. off: (N, d) its mean, 0 or more. probability: (N, 1) of that one.
+        times: (N, d) sigma of the other one, at least 1. off: (N, d) its mean, 0 or more. probability: (N, 1) of it.
     """
     low, high = np.ones_like(times), times + off / _BOUND
     for _ in range(_HALVINGS):

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the drift of the only position sensor did to heading and velocity, and to the place where no fixes come, taken back.
+"""Takes back what the drift of the only position sensor did to heading and velocity, and to the place without fixes.
 
-Its slow error is left out of the graph (`Stream.left_out`), so fixes count as if their errors were white: hundreds of them a minute
-overrule a compass by six of its sigmas, where the drift that bends their track is the likelier reason. With the error as states
-the linearised run weighs them as configured. Its heading, velocity and slow states of the other sensors are taken over. The antenna stays
-where the fixes have it, as nothing tells which part of their error is which; before the first and after the last of them it moves from
-there as in that run.
+Its slow error is left out of the graph (`Stream.left_out`), so fixes count as if their errors were white: hundreds of
+them a minute overrule a compass by six of its sigmas, although the drift that bends their track is the likelier reason.
+With the error as states the linearised run weighs them as configured. Heading, velocity and the slow states of the
+other sensors are taken from there. The antenna stays where the fixes have it, as nothing tells their error from motion;
+before the first and after the last fix it moves from there as in the linearised run.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ from graphloc.graph import antenna_off_m, corrections
 from graphloc.solve.batch import BatchResult
 from graphloc.solve.linearised import linearised, normal_solver, with_left_out
 
-_LINEAR_RAD = np.radians(15.0)  # a turn up to which the linearised run holds
+_LINEAR_RAD = np.radians(15.0)  # largest turn for which the linearised run holds
 
 
 def with_drift_taken_back(result: BatchResult) -> BatchResult:
-    """Return the result with heading, velocity, slow states and, where no fixes come, place as they are where the left-out error is a state.
+    """Return the result without what a left-out slow error did to it.
 
-    Covariances stay as they are. Nothing changes where no error is left out, or where the heading would turn by more than the linearised
-    run can tell.
+    Heading, velocity, slow states and, before the first and after the last fix, place are then as in the linearised run
+    with that error as states. Covariances stay as they are. Nothing changes where no error is left out, or where the
+    heading would turn by more than the linearised run can tell.
 
     Raises:
         RuntimeError: a state is not determined.
@@ -73,7 +74,7 @@ def with_drift_taken_back(result: BatchResult) -> BatchResult:
 
 
 def _slow_states(problem: Problem, dx: Array) -> Iterator[tuple[int, Array]]:
-    """Yield the slow states, which come last in dx (columns,), and their changes."""
+    """Yield the keys of the slow states and their changes, which come last in dx (columns,)."""
     slow = [(s.number, len(s.slow.sigma)) for s in problem.streams if s.slow is not None]
     nodes = len(problem.timeline.slow_stamps_ns)
     at = len(dx) - sum(width for _, width in slow) * nodes

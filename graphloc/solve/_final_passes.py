@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The final passes over a whole run: settled, other choices tried, and again with the noise of sensors that scatter more than they state."""
+"""The final passes over a whole run, repeated with more noise of the sensors that scatter more than they state."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from graphloc.solve._passes import SETTLED_NATS, Settled, cost_without_outliers,
 from graphloc.solve.decide import Stage, Verdicts, weigh
 from graphloc.solve.sensor_noise import scattering
 
-MAX_SENSOR_ROUNDS = 2  # that the noise of sensors is raised
-# Before other choices are tried, passes need not converge: what still changes then is a choice that confirms itself.
+MAX_SENSOR_ROUNDS = 2  # most times that the noise of sensors is raised
+# Most passes before and after other choices are tried. Before, they need not converge: what still changes then is a
+# choice that confirms itself.
 _FIRST_PASSES, LAST_PASSES = 6, 15
 
 
@@ -28,7 +29,7 @@ class RunChoice(NamedTuple):
     verdicts: Verdicts
 
     def settled_again(self, prior: StartPrior, progress: Progress) -> SolvedRun:
-        """Return the solution that it was made of, with a graph."""
+        """Return the solution with a graph again, settled from here."""
         return SolvedRun(self.problem, settle(*self, prior, progress, LAST_PASSES, SETTLED_NATS))
 
 
@@ -43,14 +44,20 @@ class SolvedRun(NamedTuple):
         return cost_without_outliers(self.settled) / max(expected_cost(self.problem, self.settled.verdicts), 1.0)
 
     def choice(self) -> RunChoice:
-        """Return it without its graph."""
+        """Return the solution without its graph."""
         return RunChoice(self.problem, self.settled.values, self.settled.verdicts)
 
 
 def as_they_scatter(
     problem: Problem, few: Thinned, estimate: gtsam.Values, prior: StartPrior, progress: Progress
 ) -> SolvedRun:
-    """Make the final passes, again with larger sigmas of the sensors that scatter more than they state (see `sensor_noise`)."""
+    """Make the final passes, and repeat them with larger sigmas of the sensors that scatter more than they state.
+
+    See `sensor_noise`.
+
+    Args:
+        few: the thinned run. estimate: of the whole run, to start from.
+    """
     settled, passes, iterations = _final_passes(problem, few, estimate, prior, progress), 0, 0
     for _ in range(MAX_SENSOR_ROUNDS):
         times = scattering(problem, settled.verdicts)
@@ -67,9 +74,10 @@ def as_they_scatter(
 def _final_passes(
     problem: Problem, few: Thinned, estimate: gtsam.Values, prior: StartPrior, progress: Progress
 ) -> Settled:
-    """Re-choose modes and weights over the whole run until they no longer change, and try other choices (see `_choices`).
+    """Re-choose modes and weights over the whole run until they no longer change, and try other choices.
 
-    A choice confirms itself, because the estimate follows it; another one that is more probable replaces it.
+    A choice confirms itself, because the estimate follows it; another one that is more probable replaces it
+    (`_choices`).
     """
     last = len(problem.timeline) - 1
     verdicts = weigh(problem, estimate, first=0, last=last, stage=Stage.FINAL)

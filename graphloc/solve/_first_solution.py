@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The first solution of a run: begun, grown and settled with the noise of its IMU as it is, and without a sensor that led it astray."""
+"""The first solution of a run: begun, grown and settled with the IMU's noise as it is, without a misleading sensor."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ from graphloc.solve.alignment import align
 from graphloc.solve.decide import AGREES, Stage, Verdicts, agrees, met
 from graphloc.solve.imu_noise import CONTRADICTION
 
-# At most, over the thinned run after growing.
+# Most passes over the thinned run after growing.
 _SEAM_PASSES = 2
-# Share of a sensor's measurements that disagree, from which the run is tried without it; and below which it tells the heading.
+# Share of a sensor's measurements that disagree: from the first on, the run is tried without it; below the second, it
+# tells the heading.
 _OFTEN, _MOSTLY = 0.3, 0.7
-_SHORTER_S = 10.0, 5.0  # first windows, where the usual one contradicts itself
+_SHORTER_S = 10.0, 5.0  # lengths of first windows, where the usual one contradicts itself
 CLEARLY = 10.0
 """Log-likelihood by which a solution must be more probable than another one to take its place."""
 
@@ -34,9 +35,11 @@ def first_solution(
 ) -> tuple[Begun, SolvedRun]:
     """Solve a run with the IMU's noise as it is; arguments and errors as of `solve_batch`.
 
-    Where that contradicts the other sensors, the run is begun without each sensor of heading or velocity, too; else without those of
-    them that disagree for long. If all measurements are clearly more probable in such a solution, it is taken: a compass that is wrong
-    for most of a run may lead the heading away, where nothing leads back. Not for `newest`, as a start online has no time for it.
+    If the IMU contradicts the other sensors by the solution's cost, the run is begun also without each sensor of
+    heading or velocity in turn; else without those of them that disagree for long. Each such start is settled with all
+    sensors. If all measurements are clearly more probable in such a solution, it is taken: a compass that is wrong for
+    most of a run may lead the heading away, where nothing leads back. This is not done for `newest`, as a start online
+    has no time for it.
     """
     few = thinned(problem)
     begun = whole = _begin(problem, few, progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
@@ -82,12 +85,15 @@ def _doubted(problem: Problem, solved: SolvedRun) -> list[Stream]:
 
 
 def _off(stream: Stream, verdicts: Verdicts) -> NDArray[np.bool_]:
-    """Return which of its measurements disagree."""
+    """Return a mask of the measurements of a sensor that disagree."""
     return np.array([verdicts[stream.number, i].weight < AGREES for i in range(len(stream.measurements))])
 
 
 def _off_for_long(off: NDArray[np.bool_]) -> bool:
-    """Whether many measurements disagree, and in a row: as many scattered outliers change twice as often."""
+    """Return whether many measurements disagree, and in a row.
+
+    If as many outliers were scattered, agreement would change twice as often as the limit.
+    """
     share = float(off.mean())
     return bool(share > _OFTEN and np.count_nonzero(off[1:] != off[:-1]) < share * (1.0 - share) * len(off))
 
@@ -101,7 +107,11 @@ def _begin(
     doubt_imu: bool = False,
     near_rad: float | None = None,
 ) -> Begun:
-    """Start a run, grow it over the thinned one, and fill in the other states."""
+    """Start a run, grow it on the thinned one, and fill in the other states.
+
+    Args:
+        few: the thinned run. Others as of `solve_batch`.
+    """
     start = align(problem)
     begun = solve_start(few.problem, start if near_rad is None else start.near(near_rad), progress, newest=newest)
     doubt_start = doubt_imu and begun.excess >= CONTRADICTION
@@ -122,7 +132,10 @@ def _begin(
 
 
 def _begun_without_a_sensor(problem: Problem, few: Thinned, begun: Begun, progress: Progress) -> Begun | None:
-    """Return the start without one of the sensors of heading or velocity, if it contradicts itself no longer and is clearly more probable."""
+    """Return the best start without a sensor of heading or velocity; None if none is good enough.
+
+    It must no longer contradict itself, and be clearly more probable.
+    """
 
     def cost(values: gtsam.Values, prior: StartPrior, last: int) -> float:
         return cost_as_configured(few.problem, values, 0, last, prior, judged=last)
@@ -147,7 +160,7 @@ def _begun_without_a_sensor(problem: Problem, few: Thinned, begun: Begun, progre
     stream, other = best
     _, residuals = met(few.problem, stream, stream.between(0, other.last), other.values)
     agree = np.mean([any(agrees(stream, residual) for residual in found) for found in residuals])
-    # Where it tells the heading after all, no other one is in doubt.
+    # If the sensor tells the heading after all, no other heading is possible.
     heading_var = np.zeros(other.last + 1) if agree > 1.0 - _MOSTLY else other.heading_var
     return begun._replace(
         values=other.values, prior=other.prior, last=other.last, iterations=iterations, heading_var=heading_var
@@ -155,12 +168,12 @@ def _begun_without_a_sensor(problem: Problem, few: Thinned, begun: Begun, progre
 
 
 def _doubt_at_once(problem: Problem, last: int, progress: Progress) -> None:
-    """Look for an IMU that is wrong in the first window, until state `last`: it spoils all that is aligned and solved there.
+    """Look for an IMU that is wrong in the first window, until state `last`.
 
-    So the run is begun with less of it, and grown from there.
+    It spoils all that is aligned and solved there, so the run is begun with less of that window, and grown from there.
 
     Raises:
-        ImuWrong: it is.
+        ImuWrong: the IMU is wrong there.
     """
     config = problem.config
     for window_s in _SHORTER_S:
@@ -174,7 +187,7 @@ def _doubt_at_once(problem: Problem, last: int, progress: Progress) -> None:
 
 
 def _from_there(problem: Problem, few: Thinned, begun: Begun, progress: Progress) -> SolvedRun:
-    """Make the final passes from a grown run."""
+    """Make the final passes from a grown run, with IMU gaps bridged and the motion model by its estimate."""
     if problem.links.gaps():
         problem = bridged(problem, begun.values)
     problem = with_usual_motion(problem, begun.values)

@@ -27,9 +27,11 @@ from graphloc.solve.wrong_imu import GrownWindow, ImuWrong, wrong_span
 from graphloc.time import duration_ns
 
 _CHUNK_S, _OVERLAP_S = 15.0, 5.0
-_SETTLED_M = 0.5  # coarse, to save rounds: passes over the whole run follow, which end at `_passes.SETTLED_M`; a choice
+# Motion below which the rounds end; coarse, to save some: passes over the whole run follow, which end at
+# `_passes.SETTLED_M`; a choice.
+_SETTLED_M = 0.5
 _MAX_ROUNDS, _MAX_FAR_ROUNDS, _FAR_SETTLED_M = 2, 8, 2.0
-_MOSTLY = 0.7  # share of a sensor's measurements; by the usual kernel 87 % of right ones agree
+_MOSTLY = 0.7  # share of a sensor's measurements that must agree; by the usual kernel 87 % of right ones do
 
 
 def grow(
@@ -46,15 +48,18 @@ def grow(
     doubt_start: bool = True,
     last: int | None = None,
 ) -> int:
-    """Take the estimate of states 0..known to state `last` (None: of the run), a chunk at a time, in place; return the iterations.
+    """Extend the estimate of states 0..known to state `last`, a chunk at a time, in place; return the iterations.
 
     Args:
+        start: prior on state 0.
         chunk_s, overlap_s: how far a step goes, and how far back its window reaches.
-        watch: called with the last state of each window and the decisions in it, as known at that time.
-        doubt_imu: whether to look for spans in which the IMU is wrong. doubt_start: also in states 0..known.
+        watch: called with the last state of each window and the verdicts in it, as known at that time.
+        doubt_imu: whether to look for spans in which the IMU is wrong. doubt_start: whether to look in states 0..known,
+            too.
+        last: None: of the run.
 
     Raises:
-        ImuWrong: there are some.
+        ImuWrong: there are such spans.
         BiasWanders: the IMU is not wrong, but its biases wander farther than configured.
     """
     stamps, slow_of = problem.timeline.stamps_ns, problem.timeline.slow_of
@@ -93,10 +98,13 @@ def grow(
 
 
 def _without_imu(window: GrownWindow, before: gtsam.Values) -> tuple[Problem, StretchStep, Verdicts, int] | None:
-    """Return the problem without the IMU where it is wrong in a window, and this solved, in place; None: it is not wrong.
+    """Look for a span of a solved window in which the IMU is wrong, and solve the window without it, in place.
 
     Args:
         before: as of `wrong_span`.
+
+    Returns:
+        The problem without the IMU there, the last step, its verdicts, and the iterations; None: the IMU is not wrong.
     """
     span = wrong_span(window, before, lambda rest: _solve_grown(window._replace(problem=rest)))
     if span is None:
@@ -109,14 +117,21 @@ def _without_imu(window: GrownWindow, before: gtsam.Values) -> tuple[Problem, St
 def _wanders(
     problem: Problem, values: gtsam.Values, start: StartPrior, before: Sequence[tuple[int, Past]]
 ) -> BiasWanders | None:
-    """Return how far the biases wander in what was known at some states, each by the data before it; None: they do not, or are not to be adapted."""
+    """Return how many times farther than configured the biases wander, as an error to raise; None: they do not.
+
+    What is known of them at some states, each by the data before it, is compared. None also where the noise of the IMU
+    is not to be adapted (`adapt_noise`).
+
+    Args:
+        start: prior on the first state. before: states, and all data before each.
+    """
     if not problem.config.sensors[problem.imu.sensor].adapt_noise:
         return None
     begin_ns = int(problem.timeline.stamps_ns[0])
     known = [KnownBias(begin_ns, start.bias.vector(), np.diagonal(start.bias_cov))]
     try:
         known += [known_bias(problem, values, k, past) for k, past in before]
-    except np.linalg.LinAlgError:  # some data do not determine them
+    except np.linalg.LinAlgError:  # the data before one of the states do not determine them
         return None
     found = [w for n, now in enumerate(known) if (w := went_too_far(known[:n], now, problem.links)) is not None]
     return BiasWanders({WALK_KEYS[k]: times for k, times in found[-1:]}) if found else None
@@ -125,9 +140,9 @@ def _wanders(
 def _solve_grown(window: GrownWindow) -> tuple[int, StretchStep, Verdicts]:
     """Solve a window, in place; return iterations, the last step and its verdicts.
 
-    New hypotheses are judged only after the other measurements have given an estimate with its covariance: with false matches in it, a
-    window solved with Huber losses alone is off by many of its own sigmas (0.01 rad/s of gyro bias, 300 m after 20 s of dead
-    reckoning).
+    New hypotheses are judged only after the other measurements have given an estimate with its covariance: with false
+    matches in it, a window solved with Huber losses alone is off by many of its own sigmas (0.01 rad/s of gyro bias,
+    300 m after 20 s of dead reckoning).
     """
     problem, values, first, known, last, prior = window
     fresh = _fresh(problem, known, last)
@@ -147,16 +162,16 @@ def _solve_grown(window: GrownWindow) -> tuple[int, StretchStep, Verdicts]:
 
 
 def _fresh(problem: Problem, known: int, last: int) -> set[tuple[int, int]]:
-    """Return the measurements with hypotheses that are new in a window."""
+    """Return the measurements of sensors with hypotheses that are new in a window."""
     return {(s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)}
 
 
 def _solve_without(window: GrownWindow, fresh: Container[tuple[int, int]]) -> tuple[StretchStep, Verdicts, int]:
     """Solve a window without its new hypotheses, in place; return the step, its verdicts, and the iterations.
 
-    Where it moves far and sensors disagree still when judged there, gentle losses may have to lead back. They also follow a sensor that
-    is wrong: a compass that is 90 deg off for the whole window bends the gyroscope's bias. So of the solution with them and those
-    before, the least costly stays.
+    If the solution moves far, and sensors still disagree with it, gentle losses may have to lead back. But these also
+    follow a sensor that is wrong: a compass that is 90 deg off for the whole window bends the gyroscope's bias. So of
+    the solutions before and after gentle losses, the least costly stays.
     """
     problem, values, first, known, last, prior = window
 
@@ -196,7 +211,7 @@ def _solve_without(window: GrownWindow, fresh: Container[tuple[int, int]]) -> tu
 
 
 def _agree(problem: Problem, verdicts: Verdicts) -> bool:
-    """Whether most measurements agree of each sensor that is judged by a loss, as wide as configured."""
+    """Return whether most measurements of each sensor without hypotheses agree, by its loss as wide as configured."""
     by_loss = {stream.number: stream for stream in problem.streams if stream.row.false is None}
     agree: dict[int, list[bool]] = {number: [] for number in by_loss}
     for (number, _), verdict in verdicts.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Position jumps of the only position sensor that show in a solution: the track bends, and parts from the fixes on either side."""
+"""Position jumps of the only position sensor that show in a solution: the track bends, and leaves the fixes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from graphloc.time import stamps_of
 
 
 def jumps_in(problem: Problem) -> int:
-    """Return how many position jumps a problem has."""
+    """Return the number of position jumps in a problem."""
     return sum(len(stream.position_jumps[0]) for stream in problem.streams)
 
 
 def with_jumps_off_track(problem: Problem, verdicts: Verdicts) -> Problem | None:
-    """Return the problem with position jumps that a solution of it shows; None where it shows no more than it has.
+    """Return the problem with the position jumps that a solution of it shows; None if it shows no new one.
 
     Args:
         verdicts: of the solution, on each measurement.
@@ -30,7 +30,7 @@ def with_jumps_off_track(problem: Problem, verdicts: Verdicts) -> Problem | None
     (stream,) = absolute
     known_ns, _ = stream.position_jumps
     if stream.left_out is None and (stream.slow is None or not len(known_ns)):
-        return None  # its error is not to be estimated, or is all the time
+        return None  # its slow error is switched off, or is estimated anyway
     raw = np.array([verdicts[stream.number, i].residual.raw[:2] for i in range(len(stream.measurements))])
     at_ns, size_m = jumps_off_track(
         stamps_of(stream.measurements), -raw.reshape(-1, 2), allowed_m=allowed_jump_m(stream.left_out or stream.slow)
@@ -43,7 +43,7 @@ def with_jumps_off_track(problem: Problem, verdicts: Verdicts) -> Problem | None
 
 
 def with_jumps_of(solved: Problem, problem: Problem) -> Problem:
-    """Return a problem with the position jumps, and the slow errors that these make states, with which it was solved."""
+    """Return a problem with the position jumps of a solved one, and with the slow errors that these make states."""
     if solved is problem:
         return problem
     jumps = ((s.slow, s.left_out, s.position_jumps) for s in solved.streams)

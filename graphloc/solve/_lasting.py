@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that last: positions whose residuals resemble those before them, although each counts as independent.
+"""Errors that last: positions whose residuals resemble those before them, although they count as independent.
 
-A track that other sensors carry (wheels, a Doppler log) shows it. So far as it follows the positions, their errors are in it and not in
-their residuals: what is found is a lower limit, and nothing found no proof.
+A track that other sensors carry (wheels, a Doppler log) shows such an error. As far as the track follows the positions,
+their errors are in it and not in the residuals. So an error that is found is a lower limit, and none found proves
+nothing.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from graphloc.frames import Array
 from graphloc.solve.decide import AGREES, Verdict
 from graphloc.time import NS_PER_S, stamps_of
 
-_FEWEST = 30  # positions: of fewer only correlations of 0.7 and more are `_SURE` (4 / sqrt(30))
-_LEAST = 0.3  # correlation from one to the next: bounds are then a third too small, or more
-_SURE = 4.0  # sigmas of the correlation of as many independent ones
+_FEWEST = 30  # fewest positions: of fewer, only correlations of 0.7 and more are `_SURE` (4 / sqrt(30))
+_LEAST = 0.3  # least correlation from one to the next: bounds are then a third too small, or more
+_SURE = 4.0  # least correlation, in sigmas of that of as many independent ones
 
 
 class Lasting(NamedTuple):
@@ -30,10 +31,10 @@ class Lasting(NamedTuple):
 
 
 def lasting(stream: Stream, verdicts: Sequence[Verdict]) -> Lasting | None:
-    """Return the error that positions of a sensor share, clearly, though none is modelled; None if there is none.
+    """Return the error that a sensor's positions clearly share though no slow error is modelled; None if there is none.
 
     Args:
-        verdicts: of each of its measurements.
+        verdicts: on each of its measurements.
     """
     used = [(m, v.residual) for m, v in zip(stream.measurements, verdicts, strict=True) if v.weight > AGREES]
     if stream.slow is not None or stream.left_out is not None or len(used) < _FEWEST:
@@ -51,15 +52,15 @@ def lasting(stream: Stream, verdicts: Sequence[Verdict]) -> Lasting | None:
 
 
 def lasting_error(t_s: Array, residuals: Array, stated_m: float) -> Lasting | None:
-    """Return the error that residuals share with those before them, clearly; None if there is none.
+    """Return the error that residuals clearly share with those before them; None if there is none.
 
-    Nor is there one where independent errors of as many as share it would be no smaller: then the bounds have it.
+    None also if the mean of as many independent errors as share it would be as large: then the bounds include it.
 
     Args:
-        t_s: (N,) when. residuals: (N, k), m. stated_m: sigma of each, of an axis.
+        t_s: (N,) times. residuals: (N, k), m. stated_m: stated sigma of each, on an axis.
     """
     n = len(residuals)
-    # What they have in common throughout is no error that lasts for a while: a datum or a mount.
+    # What all residuals have in common is no error that lasts for a while, but that of a datum or a mount.
     off = residuals - residuals.mean(axis=0)
     variance = (off**2).mean(axis=0)
     if not variance.all():

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run of hours is solved in overlapping legs, so that memory does not grow with its length.
 
-The estimate at the end of an overlap hardly depends on data before it: biases and slow errors are known again after some tens of
-seconds. Only a heading is handed on to the next leg, which takes it where no sensor measures one; not where it is a guess.
+The estimate at the end of an overlap hardly depends on the data before it: biases and slow errors are known again after
+some tens of seconds. Only the heading is handed on to the next leg, for where no sensor measures one; not where it is a
+guess.
 """
 
 from __future__ import annotations
@@ -23,17 +24,22 @@ from graphloc.time import NS_PER_S
 from graphloc.trajectory import bounds_95
 
 _OVERLAP_S, _SHARE = 60.0, 0.2  # overlap on each side of a seam, s, and at most this share of a leg
-_LOOK = 0.1  # share of a leg to each side within which a seam is placed
-_HANDED_ON_RAD = np.radians(15.0)  # largest 1 sigma of a heading that is: the next leg takes it as known
-_ENOUGH = 0.9  # share of the largest number of positions near a candidate
+_LOOK = 0.1  # share of a leg, to either side, within which a seam is placed
+_HANDED_ON_RAD = np.radians(15.0)  # largest 1 sigma of a heading that is handed on: the next leg takes it as known
+_ENOUGH = 0.9  # a seam has at least this share of the most positions that any candidate has near it
 
 Solve = Callable[[Recording, float | None], Solution]
-"""Solves a recording; with the compass heading (deg) at its start, where that is known."""
+"""Solves a recording, given the compass heading (deg) at its start, or None where that is not known."""
 
 
 @dataclass(frozen=True, slots=True)
 class Apart:
-    """The largest difference between legs at a seam; `within`: as a share of their bounds (95 %)."""
+    """The largest difference between legs at a seam.
+
+    Attributes:
+        m: of the horizontal position. deg: of the heading.
+        within: whether all differences are within the sum of both legs' bounds (95 %).
+    """
 
     m: float = 0.0
     deg: float = 0.0
@@ -44,7 +50,7 @@ def seams(recording: Recording, leg_s: float, absolute: Collection[str]) -> list
     """Return the stamps at which a run is cut into legs of at most about `leg_s`; none where it is no longer.
 
     Args:
-        absolute: sensors that measure position: a leg cannot start within an outage of them, so seams avoid these.
+        absolute: sensors that measure position. A leg cannot start within an outage of them, so seams avoid outages.
     """
     imu = recording.imu
     if imu is None or len(imu) < 2:
@@ -70,10 +76,16 @@ def overlap_ns(leg_s: float) -> int:
 def solve_legs(
     recording: Recording, seams_ns: Collection[int], leg_s: float, solve: Solve
 ) -> tuple[list[Solution], Apart]:
-    """Solve the legs of a run in turn; return the solution of each for its own time, and the largest difference at a seam.
+    """Solve the legs of a run in turn.
+
+    Args:
+        seams_ns: stamps where the run is cut. leg_s: length of a leg, for the overlap. solve: solves a leg.
+
+    Returns:
+        The solution of each leg for its own time, and the largest difference between two legs where they meet.
 
     Raises:
-        SolveError: one of them could not be solved.
+        SolveError: a leg could not be solved.
     """
     assert recording.imu is not None
     over = overlap_ns(leg_s)
@@ -92,7 +104,7 @@ def solve_legs(
 
 
 def _known_heading_deg(leg: Solution, at_ns: NDArray[np.int64]) -> float | None:
-    """Return the compass heading (deg) at a stamp (1,); None where the leg has no state there, or it is hardly known."""
+    """Return the compass heading (deg) at a stamp (1,); None if the leg has no state there, or hardly knows it."""
     if not leg.trajectory.covers(at_ns)[0]:
         return None
     there = leg.trajectory.at(at_ns)
@@ -132,7 +144,7 @@ def _own(leg: Solution, begin_ns: int, end_ns: int, before: Solution | None) -> 
     since = {name: s[own] for name, s in leg.since_agreed_s.items()}
     if before is not None:
         gone_s = (kept.stamps_ns - before.trajectory.stamps_ns[-1]) / NS_PER_S
-        for name, s in before.since_agreed_s.items():  # 'never' is never in this leg
+        for name, s in before.since_agreed_s.items():  # 'never' here means not in this leg
             own_s = since.get(name, np.full(len(kept), np.inf))
             since[name] = np.where(np.isinf(own_s), s[-1] + gone_s, own_s)
     slow = {

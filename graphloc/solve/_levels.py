@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which level of a jumping receiver is the usual one (zero error), where no other sensor measures position.
 
-A run grows from its first level, and no single step of the solver leads to another one. So the levels that the jumps lead to
-are compared as candidates: by the size of the errors that would result, and for how long they last, as a jump ends within a
-minute.
+A run grows from its first level, and no single step of the solver leads to another one. So the levels that the jumps
+lead to are compared as candidates: by the size of the errors that would result, and by how long these last, because a
+jump ends within a minute.
 """
 
 from __future__ import annotations
@@ -28,20 +28,21 @@ from graphloc.solve._passes import Settled, cost_of_run, settle
 from graphloc.solve.decide import Stage, Verdicts, decisions, weigh
 from graphloc.time import NS_PER_S, stamps_of
 
-_JUMP = 1.0  # sigmas from one node to the next: ten times the drift
-_FAR = 2.0  # sigmas: nearer, the error is at its usual level
-# Each level after each outage is another solution of the whole run.
+_JUMP = 1.0  # least step from one node to the next that counts as a jump, sigmas: ten times the drift
+_FAR = 2.0  # sigmas: an error that is nearer is at its usual level
+# Most outages, levels after each, and passes for each: every level is another solution of the whole run.
 _MOST_OUTAGES, _MOST_LEVELS, _TRIAL_PASSES = 4, 3, 6
-OUTAGE_S = 10.0  # after a shorter one dead reckoning is a metre off or less (E.dark), and bends nothing; a choice
-COMES_BACK_OFF = 6.0  # nats: of a receiver that does after an outage
+# Shortest outage: after less, dead reckoning is a metre off at most (E.dark), and bends nothing; a choice.
+OUTAGE_S = 10.0
+COMES_BACK_OFF = 6.0  # nats: price of a receiver that comes back off after an outage
 
 
 class AtLevel(NamedTuple):
     """A solution with the most probable level as the usual one, and what it was solved with.
 
     Attributes:
-        others_cov: covariance (N, 3, 3) of the position of each state that the other levels add, m^2, in world.
-        passes, iterations: that it took.
+        others_cov: (N, 3, 3) covariance that the other levels add to the position of each state, m^2, in world.
+        passes, iterations: number of those that it took.
     """
 
     problem: Problem
@@ -53,7 +54,7 @@ class AtLevel(NamedTuple):
 
 
 class _Case(NamedTuple):
-    """A solution, and the receivers whose error may be far off in it."""
+    """A solution; its streams are the receivers whose error may stay far off."""
 
     problem: Problem
     settled: Settled
@@ -63,12 +64,12 @@ class _Case(NamedTuple):
         return [s for s in self.problem.streams if s.slow is not None and s.slow.far]
 
     def paths(self) -> list[Array]:
-        """Return of each stream the slow error (N, 3) at the nodes, m."""
+        """Return, by stream, the slow error (N, 3) at the nodes, m."""
         nodes = range(len(self.problem.timeline.slow_stamps_ns))
         return [np.array([self.settled.values.atVector(keys.slow(s.number, j)) for j in nodes]) for s in self.streams]
 
     def levels(self, span: _Span | None = None) -> list[Array]:
-        """Return the levels (3,), m, of the errors, of a span: each once, without the usual one."""
+        """Return the levels (3,), m, of the errors, in a span if one is given: each once, without the usual one."""
         stamps_ns, nodes, of = self.problem.timeline.slow_stamps_ns, slice(None), None
         if span is not None:
             first = 0 if span.from_ns is None else int(np.searchsorted(stamps_ns, span.from_ns))
@@ -78,7 +79,11 @@ class _Case(NamedTuple):
         return [level for s, path in pairs if of in (None, s.number) for level in _levels(s.slow, path[nodes])]
 
     def cost(self, one: Callable[[SlowProcess, Array, Array, NDArray[np.bool_]], float], level: Array) -> float:
-        """Return the cost (nats) of the errors if this level were the usual one, by a function of process, path, time between nodes, and `anew`."""
+        """Return the cost (nats) of the errors if a level were the usual one.
+
+        Args:
+            one: cost of one error, a function of process, path (N, 3), times between nodes, and `anew`. level: (3,), m.
+        """
         dt_s = np.diff(self.problem.timeline.slow_stamps_ns) / NS_PER_S
         pairs = zip(self.streams, self.paths(), strict=True)
         steps = range(len(dt_s))
@@ -95,10 +100,11 @@ def at_usual_level(
 ) -> AtLevel:
     """Return the solution with the most probable level as the usual one, settled in at most `most` passes.
 
-    It is held there: with tails on either side, a level that is left after a quarter of the run weighs as much as the other.
+    The error is held at that level: with tails on either side, a level that is left after a quarter of the run weighs
+    as much as the other one.
 
     Args:
-        newest: the last state alone is asked for, and soon.
+        newest: whether only the last state is asked for, and soon.
     """
     case, others, passes, iterations = _Case(problem, settled), np.zeros((len(problem.timeline), 3, 3)), 0, 0
     if not case.levels() or _told_otherwise(problem, settled.verdicts):
@@ -138,11 +144,12 @@ class _Span(NamedTuple):
 
     Attributes:
         gap_ns: of the last fix before the outage, and of the first after it.
-        from_ns, until_ns: where levels are looked for: in an outage of all receivers the parts before and after it, in one of a stream
-            the part after it; None: from the begin of the run, or to its end.
-        of: number of the stream whose error is drawn anew in the outage; None: an outage of all receivers, whose errors go on.
-        back_ns: gap in which that stream's error is drawn anew next, where another level ends; None: the run ends before that, or the
-            errors go on.
+        from_ns, until_ns: where levels are looked for; None: from the begin of the run, or to its end. For an outage of
+            all receivers these are the parts before and after it, for one of a single receiver the part after it.
+        of: number of the stream whose error is drawn anew in the outage; None: an outage of all receivers, whose errors
+            go on.
+        back_ns: the next gap in which that stream's error is drawn anew, so that the level ends; None: there is none
+            before the end of the run, or the errors go on.
     """
 
     gap_ns: tuple[int, int]
@@ -153,7 +160,7 @@ class _Span(NamedTuple):
 
 
 def _outages(case: _Case) -> list[_Span]:
-    """Return where none of the receivers tells the position for long: the longest outages."""
+    """Return the longest outages in which none of the receivers tells the position."""
     stamps_ns = np.sort([m.stamp_ns for s in case.streams for m in s.measurements])
     gaps_ns = np.diff(stamps_ns)
     longest = np.sort(np.argsort(gaps_ns)[-_MOST_OUTAGES:])
@@ -163,7 +170,7 @@ def _outages(case: _Case) -> list[_Span]:
 
 
 def _drawn_anew(case: _Case) -> list[_Span]:
-    """Return where errors are drawn anew: the longest of these outages that a part with a jump follows."""
+    """Return the longest outages in which an error is drawn anew, of those that are followed by a part with a jump."""
     found: list[_Span] = []
     for stream in case.streams:
         stamps_ns = stamps_of(stream.measurements)
@@ -180,12 +187,12 @@ def _drawn_anew(case: _Case) -> list[_Span]:
 def _after_outage(
     case: _Case, span: _Span, prior: StartPrior, progress: Progress
 ) -> tuple[_Case, Array, tuple[int, int]]:
-    """Return the most probable solution with what follows an outage at another level.
+    """Return the most probable solution with what follows an outage at another level, or as it is.
 
-    There dead reckoning bends, so a receiver may have come back with an error, or without the one that it had.
+    In the outage dead reckoning bends, so a receiver may have come back with an error, or without the one that it had.
 
     Returns:
-        The solution, the covariance (N, 3, 3) that the others add, and the passes and iterations of all of them.
+        The solution, the covariance (N, 3, 3) that the other ones add, and the passes and iterations of all of them.
     """
     best, costs, places, passes, iterations = case, [_total(case, prior)], [case.places()], 0, 0
     for level in case.levels(span)[:_MOST_LEVELS]:
@@ -216,13 +223,16 @@ def _total(case: _Case, prior: StartPrior) -> float:
 
 
 def _told_otherwise(problem: Problem, verdicts: Verdicts) -> bool:
-    """Whether a sensor without such an error measures position, too."""
+    """Return whether a sensor whose error cannot stay far off measures position, too."""
     others = {s.number for s in problem.streams if s.row.absolute and (s.slow is None or not s.slow.far)}
     return any(number in others and v.weight > 0.5 for (number, _), v in verdicts.items())
 
 
 def _levels(slow: SlowProcess | None, path: Array) -> list[Array]:
-    """Return the levels (3,), m, of an error (N, 3) between its jumps: each once, without the usual one, the one held longest first."""
+    """Return the levels (3,), m, of an error (N, 3) between its jumps.
+
+    Each is there once, the one held longest first, without the usual level.
+    """
     assert slow is not None
     held = path * slow.far_axes
     jumps = 1 + np.flatnonzero(np.linalg.norm(np.diff(held / slow.sigma, axis=0), axis=1) > _JUMP)
@@ -244,13 +254,16 @@ def _away_cost(slow: SlowProcess, path: Array, dt_s: Array, _anew: NDArray[np.bo
 
 
 def _away(slow: SlowProcess, path: Array) -> NDArray[np.bool_]:
-    """Return where (N,) an error (N, 3) is far off."""
+    """Return a mask (N,) of the nodes at which an error (N, 3) is far off."""
     far = slow.far_axes
     return np.asarray(np.linalg.norm(path[:, far] / slow.sigma[far], axis=1) > _FAR)
 
 
 def _with_usual(stream: Stream, case: _Case, usual: Array) -> Stream:
-    """Return it with the nodes at which its error is at the usual level, if it has one that may be far off and there is any."""
+    """Return a stream with a mask of the nodes at which its error is at the usual level.
+
+    It is unchanged if its error cannot stay far off, or never is at that level.
+    """
     for one, path in zip(case.streams, case.paths(), strict=True):
         if one is stream and one.slow is not None and not (away := _away(one.slow, path - usual)).all():
             return replace(stream, usual=~away)
@@ -258,12 +271,16 @@ def _with_usual(stream: Stream, case: _Case, usual: Array) -> Stream:
 
 
 def _prior_moved(prior: StartPrior, by_m: Array) -> StartPrior:
-    """Return it shifted by (3,), m, in world: its position is that of the first fixes."""
+    """Return a prior shifted by (3,), m, in world, because its position is that of the first fixes."""
     return replace(prior, pose=gtsam.Pose3(prior.pose.rotation(), prior.pose.translation() + by_m))
 
 
 def _moved(case: _Case, by_m: Array, span: _Span | None = None) -> gtsam.Values:
-    """Return the run shifted by (3,), m, in world, and the slow errors of the receivers to match; what follows an outage, if one is given."""
+    """Return the values of a run shifted by (3,), m, in world, and the slow errors of its receivers to match.
+
+    Args:
+        span: the outage after which the run is shifted; None: all of it is.
+    """
     moved, timeline = gtsam.Values(case.settled.values), case.problem.timeline
 
     def shifts(stamps_ns: NDArray[np.int64]) -> Array:

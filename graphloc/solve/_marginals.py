@@ -20,11 +20,12 @@ _UNIT = gtsam.noiseModel.Unit.Create(1)
 
 
 class Marginals(NamedTuple):
-    """What a graph says.
+    """Estimate and covariances of a graph.
 
     Attributes:
-        values: after a full step. cov: (n, n) of each variable, in the tangent of the value that the graph was linearised at.
-        joint: (n, n) of the pairs that were asked for, the variables in their order.
+        values: after a full step.
+        cov: (n, n) of each variable, in the tangent of the value that the graph was linearised at.
+        joint: (n, n) of the pairs that were asked for, the two variables in the order of the pair.
     """
 
     values: gtsam.Values
@@ -33,24 +34,27 @@ class Marginals(NamedTuple):
 
 
 class _Recovered:
-    """The joint covariances of cliques of a Bayes tree, from its root as far as they are known."""
+    """The joint covariances of cliques of a Bayes tree, recovered from the root towards the leaves."""
 
     def __init__(self, dim: Mapping[int, int], order: Sequence[int]) -> None:
         self._dim, self._when = dim, {key: n for n, key in enumerate(order)}
-        # By each variable of its own: the covariance of a clique, and the rows of its variables.
+        # By frontal variable: the covariance of its clique, and the rows of the clique's variables in it.
         self._cliques: dict[int, tuple[Array, dict[int, range]]] = {}
 
     def __contains__(self, key: int) -> bool:
         return key in self._cliques
 
     def of(self, names: Sequence[int]) -> Array:
-        """Return the joint covariance of variables that are in one clique: in that of which the first eliminated one is its own."""
+        """Return the joint covariance of variables that are in one clique.
+
+        That is the clique in which the variable that was eliminated first is frontal.
+        """
         cov, rows = self._cliques[min(names, key=self._when.__getitem__)]
         picked = np.array([row for key in names for row in rows[key]])
         return cov.take(picked, axis=0).take(picked, axis=1)
 
     def add(self, conditional: Any) -> None:
-        """Add a clique, by what it says of its own variables given those of its parent, which is known."""
+        """Add a clique by its conditional: frontal variables given its separator, whose covariance is known already."""
         names, (root, singular) = conditional.keys(), dtrtri(conditional.R())
         if singular:
             raise np.linalg.LinAlgError("a variable is not determined")
@@ -65,19 +69,20 @@ class _Recovered:
         across = A @ cov[m:, m:]
         spread = root @ root.T + across @ A.T
         cov[:m, m:], cov[m:, :m] = across, across.T
-        cov[:m, :m] = 0.5 * (spread + spread.T)  # else what is not symmetric grows, tenfold in a second
+        cov[:m, :m] = 0.5 * (spread + spread.T)  # else the asymmetry grows, tenfold in a second
         self._cliques |= dict.fromkeys(own, (cov, rows))
 
 
 def marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, together: Collection[Pair] = ()) -> Marginals:
     """Eliminate a graph linearised at `values` by QR, and go back from the root of its Bayes tree to the leaves.
 
-    The variables x of a clique are R x = d - S y in white noise, given those y that it shares with its parent. So with A = -R^-1 S
+    The frontal variables x of a clique are R x = d - S y in white noise, given its separator y, which its parent has,
+    too. So with A = -R^-1 S
 
         cov(x, y) = A cov(y)   cov(x) = R^-1 R^-T + A cov(y) A^T
 
-    (Kaess and Dellaert, Covariance recovery from a square root information matrix for data association, 2009). GTSAM's own marginals
-    eliminate anew for each variable, and take five times as long.
+    (Kaess and Dellaert, Covariance recovery from a square root information matrix for data association, 2009). GTSAM's
+    own marginals eliminate anew for each variable, and take five times as long.
 
     Args:
         together: pairs of variables whose joint covariance is wanted.
@@ -88,7 +93,7 @@ def marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, together:
     try:
         linear = graph.linearize(values)
         dim = values.dims()
-        for a, b in together:  # what says nothing of two variables still puts them into one clique
+        for a, b in together:  # a factor without information puts both into one clique
             linear.add(gtsam.JacobianFactor(a, np.zeros((1, dim[a])), b, np.zeros((1, dim[b])), np.zeros(1), _UNIT))
         ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)

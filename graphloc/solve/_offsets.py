@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the cost of a solved run would change if a lever arm, a mount or a stamp were not as configured.
 
-The solution has adapted to the configuration, so its residuals alone show too little; here all states follow the offset. The
-graph is linearised at the solution, J dx = b in whitened rows, with one column B for each offset theta. A sensor that is
-mounted elsewhere, or measures at another time, measures what it would if the body were elsewhere, e(T Exp(xi theta)), so
+The solution has adapted to the configuration, so its residuals alone show too little; here all states follow the
+offset. The graph is linearised at the solution, J dx = b in whitened rows, with one column B for each offset theta. A
+sensor that is mounted elsewhere, or measures at another time, measures what it would if the body were elsewhere, e(T
+Exp(xi theta)), and moved otherwise, v + eta theta, so
 
     B = J_pose xi + J_velocity eta
 
-with (rotation, translation; body axes) xi = (0, e) for a lever along e, (z, -z x l) for a yaw of the mount at l,
-(w, R'v) for a stamp; and eta = R (w x e), 0, a: the change of velocity at the end of the lever. The part of B that no change
-of the states explains, B~ = B - J argmin |J X - B|, carries the information on theta: H = B~'B~, g = B~'b.
+                            xi (rotation, translation; body axes)    eta (world axes)
+    lever arm along e       (0, e)                                   R (w x e)
+    yaw of a mount at l     (z, -z x l)                              0
+    stamp                   (w, R'v)                                 a
 
-Robust weights are chosen again with the offsets free: otherwise the effect of a wrong lever in a turn would count as a jump of
-the GNSS error.
+with unit vectors e and z (up), and attitude R, rate w, velocity v and acceleration a of the body. The part of B that no
+change of the states explains, B~ = B - J argmin |J X - B|, carries the information on theta: H = B~'B~, g = B~'b.
+
+Robust weights are chosen again with the offsets free: otherwise the effect of a wrong lever in a turn would count as a
+jump of the GNSS error.
 """
 
 from __future__ import annotations
@@ -33,12 +38,12 @@ from graphloc.solve.batch import BatchResult
 from graphloc.solve.imu_noise import imu_misfit
 from graphloc.solve.linearised import Rows, linearised, normal_solver, with_left_out
 
-BLOCK_S = 2.0  # over which residuals are summed; `eval/calibrate` puts these together to 10 s, as errors last; a choice
-# Rounds of choosing weights; they end early where the weights, or theta (in sigmas), change little.
+BLOCK_S = 2.0  # length of a sum of residuals; `eval/calibrate` puts these together to 10 s, as errors last; a choice
+# Most rounds of choosing weights; they end earlier if the weights, or theta (in sigmas), change by less.
 _ROUNDS, _SAME_WEIGHT, _SAME = 6, 0.2, 0.1
-# How far an offset may be off while weights are chosen, 1 sigma: m, rad, s.
+# Prior sigma of an offset while weights are chosen: m, rad, s.
 _FREE: dict[Offset, float] = {"x": 3.0, "y": 3.0, "yaw": 0.5, "time": 1.0}
-_HELD = 1e-6  # sigma, rad or s, of what is held
+_HELD = 1e-6  # sigma, rad or s, of an axis that is held
 
 
 def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
@@ -92,10 +97,11 @@ def offsets_of(result: BatchResult, probe: Probe) -> Offsets | None:
 
 
 def _antenna_of(problem: Problem, stream: Stream, probe: Probe) -> str:
-    """Return the sensor whose lever a stream shares: the first of the first kind in `probe` at its place, of which it is another output.
+    """Return the sensor whose lever arm a stream shares as another output of one antenna; else its own name.
 
-    Fixes and velocities of one antenna, both configured where it is not, bear each other out: one at a time, neither could
-    leave. Two of a kind are two antennas.
+    That is the first sensor mounted at the same place whose kind comes before its own in `probe`. Fixes and velocities
+    of one antenna, both configured where it is not, confirm each other: examined one at a time, neither could leave.
+    Two sensors of one kind are two antennas.
     """
     kinds = list(probe)
     before = [kind for kind in kinds[: kinds.index(stream.config.kind)] if "x" in probe[kind]]
@@ -105,7 +111,7 @@ def _antenna_of(problem: Problem, stream: Stream, probe: Probe) -> str:
 
 
 def _in_blocks(rows: Rows, left: Array, r: Array) -> tuple[Array, Array]:
-    """Return left'r (n, k) and left'left (n, k, k) of each block of time."""
+    """Return left'r (n, k) and left'left (n, k, k) of each of n blocks of time."""
     block = (rows.stamps_ns - rows.stamps_ns.min()) // round(BLOCK_S * 1e9)
     order = np.argsort(block, kind="stable")
     edges = np.searchsorted(block[order], np.arange(int(block.max()) + 2))
@@ -114,7 +120,11 @@ def _in_blocks(rows: Rows, left: Array, r: Array) -> tuple[Array, Array]:
 
 
 def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values, StartPrior]:
-    """Return the problem without offsets of mounts and stamps that are states already, that of the IMU's mount among them, and with the slow errors that were left out."""
+    """Return the problem with nothing that absorbs an offset, and with the slow errors that were left out.
+
+    Offsets of mounts and stamps that are states, and that of the IMU's mount, are as configured. Values and prior are
+    returned to match.
+    """
     problem, values = with_left_out(result.problem, result.values)
     prior = result.prior
     if problem.imu_turn_rad.any():
@@ -130,14 +140,17 @@ def _with_offsets_free(result: BatchResult) -> tuple[Problem, gtsam.Values, Star
 
 
 def _surveyed(stream: Stream) -> tuple[Constant, ...]:
-    """Return a stream's constants without those that correct a setting: as configured, they are zero."""
+    """Return the constants of a stream that correct no setting; the others are zero: as configured."""
     return tuple(constant for constant in stream.constants if not constant.corrects)
 
 
 def _without(
     axes: Collection[int | None], problem: Problem, stream: Stream, slow: SlowProcess, values: gtsam.Values
 ) -> SlowProcess | None:
-    """Return the slow state without some axes (the yaw of a mount, a delay), which are held as configured (in `values` too); None where nothing else is in it."""
+    """Return a slow state with some axes (yaw of a mount, a delay) held as configured, in `values`, too.
+
+    None if it has no other axes.
+    """
     if len(slow.axes) == len(axes):
         return None
     held = np.array([k in axes for k in range(len(slow.axes))])
@@ -155,7 +168,7 @@ def _columns(
     result: BatchResult,
     wanted: tuple[Offset, ...],
 ) -> Array:
-    """B (rows, wanted) of one sensor."""
+    """Return B (rows, wanted) of one sensor."""
     used = rows.used(stream)
     if not used:
         return np.zeros((len(rows.b), len(wanted)))

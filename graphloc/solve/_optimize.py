@@ -9,13 +9,17 @@ import gtsam
 
 from graphloc.errors import not_solved
 
-_ABSOLUTE_TOL = 1e-3  # nats of the cost: choices hang on whole ones; a choice
-_AS_PROMISED = 0.1  # of the tolerance: agreement with the linear model
+_ABSOLUTE_TOL = 1e-3  # nats of the cost: decisions depend on whole ones; a choice
+_AS_PROMISED = 0.1  # share of the tolerance within which a step agrees with the linear model
 _HOPELESS = 1e6  # times the initial cost: full steps do not recover from there
 
 
 class Optimized(NamedTuple):
-    """Result of one optimisation: values, iterations, final error (half of the weighted squares)."""
+    """Result of one optimisation.
+
+    Attributes:
+        values: the best that were found. iterations: number of those that it took. error: half of the weighted squares.
+    """
 
     values: gtsam.Values
     iterations: int
@@ -30,13 +34,13 @@ def optimize(
 ) -> Optimized:
     """Minimise with Gauss-Newton, and with Levenberg-Marquardt where that does not reduce the cost.
 
-    Full steps: from a start some degrees and metres off, the first one overshoots (cost x 60) and the second converges; a method
-    that accepts no increase of the cost takes many short steps instead (measured: 3 against 48 iterations, docs/decisions). QR:
-    with Cholesky the solver stops early, not converged, on slow biases.
+    Full steps: from a start some degrees and metres off, the first one overshoots (cost x 60) and the second converges;
+    a method that accepts no increase of the cost takes many short steps instead (measured: 3 against 48 iterations,
+    docs/decisions). QR: with Cholesky the solver stops early, not converged, on slow biases.
 
     Args:
-        relative_tol: of the error; it ends where a step reduces it by less, or where the reduction equals that of the linear
-            model to a tenth of this: then there is no nonlinearity left that another step could correct.
+        relative_tol: of the error. Iterations end where a step reduces it by less, or where the reduction equals that
+            of the linear model to a tenth of this: then no nonlinearity is left that another step could correct.
 
     Raises:
         SolveError: the linear algebra failed (an undetermined state, or a value that is not finite).
@@ -48,7 +52,7 @@ def optimize(
         while used < max_iterations:
             linear = stepper.iterate()
             following, error, used = _of(stepper), float(stepper.error()), used + 1
-            if not error < _HOPELESS * (initial + 1.0):  # also where it is not a number
+            if not error < _HOPELESS * (initial + 1.0):  # also if it is NaN
                 break
             if error < lowest:
                 best, lowest = following, error
@@ -68,19 +72,22 @@ def optimize(
 
 
 def _stepper(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> gtsam.GaussNewtonOptimizer:
-    """Return what takes full steps: `eliminateMultifrontal` with QR calls back into Python for each clique, a fifth of its time."""
+    """Return an optimiser that takes full steps.
+
+    `eliminateMultifrontal` with QR would call back into Python for each clique, a fifth of its time.
+    """
     params = gtsam.GaussNewtonParams()
     params.setLinearSolverType("MULTIFRONTAL_QR")
     return gtsam.GaussNewtonOptimizer(graph, guess, params)
 
 
 def _promised(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, following: gtsam.Values) -> float:
-    """Return by how much a step lowers the cost of the linear model, nats: half the square of its length in sigmas."""
+    """Return by how much a step lowers the cost of the linear model, nats: half its squared length in sigmas."""
     return float(linear.error(values.zeroVectors()) - linear.error(values.localCoordinates(following)))
 
 
 def _of(stepper: gtsam.GaussNewtonOptimizer) -> gtsam.Values:
-    """Return a copy of its values: what `values` returns refers to memory that the next step frees."""
+    """Return a copy of the optimiser's values: what `values` returns refers to memory that the next step frees."""
     return gtsam.Values(stepper.values())
 
 
@@ -101,7 +108,9 @@ def _levenberg_marquardt(
 
 
 def full_step(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> tuple[gtsam.Values, float]:
-    """Return the result of one full step from near the solution, and by how much the linear model says that it lowers the cost, nats.
+    """Return the values after one full step from near the solution, and by how much it should lower the cost, nats.
+
+    The latter is by the linear model.
 
     Raises:
         SolveError: a state is not determined.

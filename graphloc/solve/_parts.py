@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run with a long IMU gap is solved in parts: cut there, each solved by itself (in legs, if it is long), then joined.
 
-Across a gap of minutes nothing connects the two sides. Solved as one graph, both sides were distorted by the factor that
-bridges the gap (120 s: errors of 4.6 m and 30 deg beside it, where 0.1 m is usual).
+Across a gap of minutes nothing connects the two sides. Solved as one graph, both sides were distorted by the factor
+that bridges the gap (120 s: errors of 4.6 m and 30 deg beside it, where 0.1 m is usual).
 """
 
 from __future__ import annotations
@@ -72,9 +72,10 @@ def solve_parts(
 def _in_legs(
     part: Recording, where: Collection[int], leg_s: float, solve: Solve
 ) -> tuple[list[Solution], list[str], bool]:
-    """Solve a part, in legs where it is long, between the stamps `where`; as a whole where a leg cannot be solved by itself.
+    """Return the solutions of a part: in legs, cut at the stamps `where`, if it is long.
 
-    Also returns the lines to report, and whether they are warnings.
+    It is solved as a whole if a leg cannot be solved by itself. Also returns the lines to report, and whether they are
+    warnings.
     """
     if not where:
         return [solve(part, None)], [], False
@@ -88,7 +89,7 @@ def _in_legs(
 
 
 def _cut(recording: Recording, bridge_s: float) -> list[Recording]:
-    """Return the parts in order; each has the measurements from its own first IMU sample up to that of the next part."""
+    """Return the parts in order; each has the measurements from its first IMU sample up to that of the next part."""
     imu = recording.imu
     if imu is None or len(imu) < 2:
         return [recording]
@@ -111,7 +112,11 @@ def _refused(part: Recording, why: str) -> list[LedgerRow]:
 
 
 def _join(solutions: Sequence[Solution], rows: Sequence[LedgerRow], warnings: Sequence[str]) -> Solution:
-    """Return the solutions of all parts, or legs, as one; `rows`: of the ledger, of no part."""
+    """Return the solutions of all parts, or legs, as one.
+
+    Args:
+        rows: ledger rows that are of no solution.
+    """
     tracks = [s.trajectory for s in solutions]
     offsets = [s.offsets for s in solutions if s.offsets is not None]
     return Solution(
@@ -132,7 +137,7 @@ def _join(solutions: Sequence[Solution], rows: Sequence[LedgerRow], warnings: Se
 
 
 def _columns(parts: Sequence[object], *names: str) -> dict[str, Any]:
-    """Return the columns of these names, each of all parts that have it, one after another."""
+    """Return the columns of these names, each from all parts that have it, one after another."""
     return {
         name: np.concatenate([column for part in parts if (column := getattr(part, name)) is not None])
         for name in names
@@ -140,7 +145,7 @@ def _columns(parts: Sequence[object], *names: str) -> dict[str, Any]:
 
 
 def _by_name(parts: Iterable[Mapping[str, _T]]) -> dict[str, list[_T]]:
-    """Return what parts of a run have under each name."""
+    """Return, by name, what the parts of a run have under it."""
     found: dict[str, list[_T]] = {}
     for name, own in chain.from_iterable(part.items() for part in parts):
         found.setdefault(name, []).append(own)
@@ -148,12 +153,12 @@ def _by_name(parts: Iterable[Mapping[str, _T]]) -> dict[str, list[_T]]:
 
 
 def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[np.float64]]:
-    """Return the mean of what parts of a run have found, by name."""
+    """Return, by name, the mean over the parts of a run that have it."""
     return {name: np.mean(own, axis=0) for name, own in _by_name(parts).items()}
 
 
 def _since_agreed(solutions: Sequence[Solution]) -> dict[str, NDArray[np.float64]]:
-    """Return how long each sensor has not agreed, s, by state; never in a part that it does not measure in."""
+    """Return, by sensor and state, how long it has not agreed, s; inf in a part in which it does not measure."""
     never = [np.full(len(s.trajectory), np.inf) for s in solutions]
     return {
         name: np.concatenate([s.since_agreed_s.get(name, none) for s, none in zip(solutions, never, strict=True)])
@@ -184,7 +189,7 @@ def _join_stats(parts: Sequence[SolveStats], warnings: Sequence[str]) -> SolveSt
 
 
 def _said_once(lines: Sequence[str]) -> list[str]:
-    """Return the warnings of all parts, each once; of graded ones about the same, the one with the largest figure."""
+    """Return the warnings of all parts, each once; of graded ones about one matter, that with the largest figure."""
     worst, parts = dict[str, Graded](), Counter[str]()
     for line in lines:
         if isinstance(line, Graded):

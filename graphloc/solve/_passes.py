@@ -16,7 +16,8 @@ from graphloc.solve.stretch import moved, unwound
 
 SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1
 SETTLED_NATS = 0.1
-"""Of the cost, by which a step changes it: half a sigma of what it moves. A heading that nothing tells turns by degrees at each."""
+"""A step that changes the cost by less moves nothing by more than half a sigma. A heading that nothing tells turns by
+degrees at each step."""
 # Of the thinned run: the passes over the whole one begin there and go on to `SETTLED_M`; a choice.
 _ROUGHLY_SETTLED_M = 0.5
 _UPHILL = 1.1  # times the cost before: above it a single step has failed
@@ -25,9 +26,14 @@ _OUTLIER = 0.1  # weight under its own kernel below which a measurement is an ou
 
 @dataclass(frozen=True, slots=True)
 class Optimised:
-    """One optimisation of the whole run: values, the graph they come from, and how far any pose moved.
+    """One optimisation of the whole run.
 
-    `made`: where the factors of each measurement stand in the graph. `changed_nats`: by how much a single step changed the cost, or should have.
+    Attributes:
+        values: the result. graph: the graph that it comes from. made: range of the factors of each measurement in the
+            graph.
+        iterations: number of those that it took. moved_m: how far any pose moved.
+        changed_nats: by how much a single step changed the cost, or should have by the linear model, whichever is more;
+            inf: it was not a single step.
     """
 
     values: gtsam.Values
@@ -38,7 +44,7 @@ class Optimised:
     changed_nats: float = float("inf")
 
     def settled(self, nats: float) -> bool:
-        """Return whether it moved the track by little, or changed the cost by less than so much."""
+        """Return whether it moved the track by little, or changed the cost by less than `nats`."""
         return self.moved_m < SETTLED_M or self.changed_nats < nats
 
 
@@ -57,7 +63,7 @@ def _iterated(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values, made: Made
 
 
 def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Optimised:
-    """Take one step over the whole run, and iterate only where the cost rises by more than a nonlinear step near the minimum does."""
+    """Take one step over the whole run; iterate only if it raises the cost more than a step near the minimum may."""
     last, made = len(problem.timeline) - 1, Made()
     graph, guess = build_graph(problem, estimate, decisions(verdicts), 0, last, prior, made=made)
     values, promised = full_step(graph, guess)
@@ -69,7 +75,12 @@ def refine_run(problem: Problem, estimate: gtsam.Values, verdicts: Verdicts, pri
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settled:
-    """A solution of the whole run, and the graph of its last step (`made` as in `Optimised`)."""
+    """A solution of the whole run.
+
+    Attributes:
+        graph: of the last step. made: as in `Optimised`. verdicts: by `values`.
+        passes, iterations: number of those that it took. converged: whether the last step hardly changed it.
+    """
 
     values: gtsam.Values
     graph: gtsam.NonlinearFactorGraph
@@ -89,7 +100,11 @@ def settle(
     most: int,
     nats: float = 0.0,
 ) -> Settled:
-    """Run passes until modes and weights no longer change, at most `most`, nor the track; or the cost by `nats`, wherever the track goes."""
+    """Run passes until modes, weights and the track no longer change.
+
+    Args:
+        most: most passes. nats: passes end also where a step changes the cost by less, wherever the track goes.
+    """
     last, iterations = len(problem.timeline) - 1, 0
     done: Optimised | None = None
     for n in range(most):
@@ -115,7 +130,7 @@ def settle(
 
 
 def _date(verdicts: Verdicts, before: Verdicts, n: int) -> None:
-    """Note in `verdicts`, in place, since which pass each mode is unchanged: `n` where it has just changed."""
+    """Note in `verdicts`, in place, since which pass each mode is unchanged: since this one, `n`, if it changed now."""
     for key, verdict in verdicts.items():
         old = before[key]
         settled = old.settled if old.mode == verdict.mode else n
@@ -136,7 +151,9 @@ def rough_passes(
     stages: Sequence[Stage],
     most: int,
 ) -> tuple[gtsam.Values, int, int]:
-    """Solve the whole run with the losses of each stage; rebuild the graph until the estimate hardly moves, as attachments depend on it.
+    """Solve the whole run with the losses of each stage, until the estimate hardly moves.
+
+    The graph is rebuilt for each pass, as attachments depend on the estimate.
 
     Returns:
         The values, iterations, and passes, at most `most` for each stage.
@@ -156,10 +173,10 @@ def rough_passes(
 
 
 def cost_without_outliers(settled: Settled) -> float:
-    """Return 2 x the cost, without the share of outliers (by the sensor's own kernel).
+    """Return twice the cost, without that of outliers (by the sensor's own kernel).
 
-    The kernel width follows the median of the sensor's residuals, so outliers are few and far off: no noise of another sensor
-    explains them.
+    The kernel width follows the median of the sensor's residuals, so outliers are few and far off: no noise of another
+    sensor explains them.
     """
     outliers = [
         settled.graph.at(factor).error(settled.values)
@@ -171,7 +188,7 @@ def cost_without_outliers(settled: Settled) -> float:
 
 
 def expected_cost(problem: Problem, verdicts: Verdicts, last: int = -1) -> float:
-    """Return the degrees of freedom of the weighted problem up to state `last`: the expectation of 2 x its cost."""
+    """Return the degrees of freedom of the weighted problem up to state `last`: the expectation of twice its cost."""
     slow_of = problem.timeline.slow_of
     n, m = len(slow_of[:last]) + 1, int(slow_of[last]) + 1
     expected = sum(v.expected_cost for v in verdicts.values())
@@ -180,23 +197,24 @@ def expected_cost(problem: Problem, verdicts: Verdicts, last: int = -1) -> float
         expected += 2.0 * sum(j < m - 1 for j in problem.usual_motion.nodes)
     for stream in problem.streams:
         if stream.slow is not None:
-            expected += m * int((~stream.slow.constant).sum())  # a constant's steps are as many as its nodes
+            expected += m * int((~stream.slow.constant).sum())  # a constant has as many rows as nodes
     return expected
 
 
 def cost_as_configured(
     problem: Problem, values: gtsam.Values, first: int, last: int, prior: StartPrior | Past, *, judged: int
 ) -> float:
-    """Return -log of how probable states first..last are (but for a constant), with each sensor's loss as wide as configured.
+    """Return -log of the probability of states first..last, with each sensor's loss as wide as configured.
 
-    Other than the cost of their graph, it does not fall where a loss is widened because the residuals around an estimate scatter.
+    It is known up to an additive constant. Unlike the cost of the graph of these states, it does not fall where a loss
+    is widened because the residuals around an estimate scatter.
 
     Args:
         judged: the last state whose measurements of sensors with hypotheses count.
     """
     graph, guess = build_graph(problem, values, {}, first, last, prior)
     cost = float(graph.error(guess)) - log_evidence(problem, values, first, judged)
-    # Of constants that the prior knows, it is in the graph.
+    # A `Past` has the priors of the constants that it knows.
     cost += cost_of_constants(problem, values, prior.known if isinstance(prior, Past) else ())
     for stream in problem.streams:
         if stream.row.false is None:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixes of the only position sensor that lead astray after an outage.
 
-Out of a tunnel, or from under a bridge, a receiver comes back tens of metres off, and converges within half a minute while it states
-metres. Its fixes err alike, so each loss of its own sees them agree, and the track through the outage bends to them. So the run is
-solved without them, too: an error that comes back with a receiver and leaves it again is one event, however many fixes have it.
+Out of a tunnel, or from under a bridge, a receiver comes back tens of metres off while it states metres, and converges
+within half a minute. The errors of these fixes are alike, so the loss of each finds that they agree, and the track
+through the outage bends to them. So the run is solved without them, too: an error that comes back with a receiver and
+leaves it again is one event, however many fixes have it.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from graphloc.solve._levels import COMES_BACK_OFF, OUTAGE_S
 from graphloc.solve.decide import Verdicts, far_sigmas, met
 from graphloc.time import NS_PER_S, duration_ns, stamps_of, utc_text
 
-_CONVERGES_S = 60.0  # for so long after an outage its fixes are doubted
-_CONVERGED = 0.75  # of that time, in which it must have
-_STILL = 1.5  # as what is far off converges, it is off for longer
-_RIGHT = 1.5  # nats that a right fix costs at least, half of its axes
-_FAR = 2.0  # sigmas, of fix and slow error, off the track: nearer, a fix has converged
+_CONVERGES_S = 60.0  # length of the time after an outage in which fixes are doubted
+_CONVERGED = 0.75  # share of that time in which the receiver must have converged
+_STILL = 1.5  # fixes are left out for so many times as long as they are far off, as the error fades slowly
+_RIGHT = 1.5  # nats that a right fix costs at least: half of its axes
+_FAR = 2.0  # sigmas, of fix and slow error, off the track: a fix that is nearer has converged
 
 
 class Return(NamedTuple):
@@ -42,7 +43,7 @@ class Return(NamedTuple):
     off_m: float = 0.0
 
     def said(self, stream: Stream) -> str:
-        """Say it, for the user."""
+        """Return a warning on these fixes."""
         began, back = self.outage_ns
         return (
             f"{stream.name}: back from an outage of {(back - began) / NS_PER_S:.0f} s at {utc_text(back)} it was up to {self.off_m:.0f} m "
@@ -54,10 +55,10 @@ class Return(NamedTuple):
 
 
 class Returns(NamedTuple):
-    """Returns of one receiver.
+    """Returns of one receiver from outages.
 
     Attributes:
-        number: of its stream. usual: cost (nats) that comes with each of its other fixes.
+        number: of its stream. usual: cost (nats) that comes with each of its other fixes. each: the returns.
     """
 
     number: int
@@ -65,7 +66,10 @@ class Returns(NamedTuple):
     each: tuple[Return, ...]
 
     def price(self, problem: Problem) -> float:
-        """Return what it costs (nats) to leave them out: that a receiver comes back off, for how long, and what such fixes cost anyway."""
+        """Return the price (nats) of leaving the fixes of all returns out.
+
+        It is that of a receiver that comes back off, of the time for which it is off, and what such fixes cost anyway.
+        """
         lasts_s = sum(one.lasts_s(self._stream(problem)) for one in self.each)
         fixes = sum(len(one.fixes) for one in self.each)
         return COMES_BACK_OFF * len(self.each) + lasts_s / MEAN_S + self.usual * fixes
@@ -74,7 +78,7 @@ class Returns(NamedTuple):
         return next(s for s in problem.streams if s.number == self.number)
 
     def left_out_of(self, problem: Problem) -> Problem:
-        """Return the problem without their fixes."""
+        """Return the problem without the fixes of these returns."""
         stream = self._stream(problem)
         gone = np.array([i for one in self.each for i in one.fixes], dtype=np.int64)
         kept = stream.only(np.setdiff1d(np.arange(len(stream.measurements)), gone))
@@ -92,10 +96,14 @@ class Returns(NamedTuple):
         )
 
     def still_off(self, problem: Problem, without: RunChoice, cost: float) -> Returns:
-        """Return of their fixes those that a solution without them shows to be far off, all before them, and some after them.
+        """Return these returns with those of their fixes that are far off by a solution without them.
+
+        Of each return, these are all fixes up to the last one that is far off, and some after it. A return that does
+        not converge soon enough is dropped.
 
         Args:
-            cost: of that solution, nats. Where its own fixes bend it as well, or it takes them for off, it is no merit that these do not.
+            without: that solution. cost: of it, nats. It gives `usual`: if other fixes bend this solution as well, or
+                are far off by it, it is no merit that the fixes left out do not.
         """
         stream, found = self._stream(problem), list[Return]()
         stamps_ns = stamps_of(stream.measurements)
@@ -106,7 +114,7 @@ class Returns(NamedTuple):
             if len(far):
                 since_ns = stamps_ns[one.fixes] - one.outage_ns[1]
                 count = int(np.searchsorted(since_ns, _STILL * since_ns[far[-1]], side="right"))
-                # Where it is the IMU that is off, the track is off nearly till the next fix that is used.
+                # If the IMU is off instead, the track stays off nearly until the next fix that is used.
                 if since_ns[far[-1]] < _CONVERGED * since_ns[-1]:
                     found.append(Return(one.outage_ns, one.fixes[:count], float(off_m[far].max())))
         others = sum(
@@ -117,12 +125,13 @@ class Returns(NamedTuple):
 
 
 def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Returns | None:
-    """Return the fixes after each outage through which a solution is bent, or that it takes to be far off; None where there are none.
+    """Return the fixes after outages that bend a solution, or that are far off by it; None if there are none.
 
-    Only what the IMU, these fixes and jumps of their slow error cost can be saved by leaving them out: else it need not be tried.
+    Leaving them out can save only what the IMU, these fixes and jumps of their slow error cost: where that is little,
+    it need not be tried.
 
     Args:
-        misfit: of the solution: as much as anywhere tells nothing.
+        misfit: of the solution: if it is as large everywhere, a cost after an outage tells nothing.
     """
     absolute = [s for s in problem.streams if s.row.absolute]
     if len(absolute) != 1 or absolute[0].row.false is not None or len(absolute[0].position_jumps[0]):
@@ -148,7 +157,7 @@ def _returns(stream: Stream) -> list[Return]:
     stamps_ns = stamps_of(stream.measurements)
     back = np.flatnonzero(np.diff(stamps_ns) > OUTAGE_S * NS_PER_S) + 1
     ends = np.searchsorted(stamps_ns, stamps_ns[back] + duration_ns(_CONVERGES_S))
-    # A third of them must tell the place afterwards, before the next outage.
+    # At least a third of the fixes before the next outage must be left, to tell the place.
     until = np.minimum(ends, back + 2 * np.diff(back, append=len(stamps_ns)) // 3)
     pairs = zip(back.tolist(), until.tolist(), strict=True)
     return [Return((int(stamps_ns[a - 1]), int(stamps_ns[a])), range(a, b)) for a, b in pairs if b > a]
@@ -161,7 +170,7 @@ def _costs(stream: Stream, verdicts: Verdicts) -> Array:
 
 
 def _sigma_m(stream: Stream, cov: Array) -> float:
-    """Return how far a fix may be off by its covariance (3, 3), m^2, and its slow error, m."""
+    """Return the sigma of a fix, m, by its covariance (3, 3), m^2, and its slow error."""
     slow = stream.slow or stream.left_out
     usual = 0.0 if slow is None else float(np.abs(slow.sigma * slow.scale)[slow.far_axes].max(initial=0.0))
     return float(np.hypot(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]), usual))

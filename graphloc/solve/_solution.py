@@ -38,10 +38,11 @@ from graphloc.solve.unmodelled import unmodelled
 from graphloc.solve.warnings import mount_event, mount_warning, stats_of
 from graphloc.trajectory import Trajectory
 
-# Within which a track is told from a berth, whose tags are seen from 25 m; only what is written hangs on it.
+# Distance from a berth within which the track is also given from there; its tags are seen from 25 m. Only outputs
+# depend on it.
 _NEAR_BERTH_M = 60.0
-_SHOWN_RAD = np.radians(15.0)  # 1 sigma, somewhere in the run, from which the motion tells the heading
-_TOLD_RAD = np.radians(7.0)  # 1 sigma of a heading of which those 30 deg beside it cost 8 more, as in `_start`
+_SHOWN_RAD = np.radians(15.0)  # 1 sigma, somewhere in the run, below which the motion tells the heading
+_TOLD_RAD = np.radians(7.0)  # 1 sigma of a heading for which headings 30 deg off cost 8 nats more, as in `_start`
 
 
 class _States(NamedTuple):
@@ -56,7 +57,11 @@ class _States(NamedTuple):
 
 
 def make_solution(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
-    """Return what the solver hands over."""
+    """Return the solution of a run.
+
+    Args:
+        problem: with the noise as configured. recording: what was measured. result: of the solver.
+    """
     known = result
     result, unsaid = _without_drift(known)
     states = _states_of(problem, result)
@@ -99,7 +104,10 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
 
 
 def _states_of(problem: Problem, result: BatchResult) -> _States:
-    """Return the states, moved from the IMU's place to the body's origin, with the covariance of the graph and of other levels."""
+    """Return the states, moved from the IMU to the body's origin.
+
+    Their covariance is that of the graph, with that of slow errors that are left out, and of other levels.
+    """
     states, values = range(len(problem.timeline)), result.values
     poses = [values.atPose3(keys.pose(k)) for k in states]
     R = np.array([p.rotation().matrix() for p in poses])
@@ -132,7 +140,7 @@ def _states_of(problem: Problem, result: BatchResult) -> _States:
 
 
 def _widen(result: BatchResult, states: _States) -> list[str]:
-    """Widen the covariances, in place, by what the graph does not know of; return warnings."""
+    """Widen the covariances, in place, by what the graph does not know; return warnings."""
     cov, v_cov = states.trajectory.cov, states.v_cov
     assert cov is not None
     guess = _add_others(result, cov)
@@ -147,7 +155,7 @@ def _widen(result: BatchResult, states: _States) -> list[str]:
 
 
 def _add_doubt(result: BatchResult, cov: Array) -> list[str]:
-    """Widen position and heading by what the choice of modes leaves open; return warnings, one where that fails."""
+    """Widen position and heading by the doubt about the choice of modes; return warnings, also where that fails."""
     try:
         return widen_by_doubt(result, cov)
     except (SolveError, RuntimeError, np.linalg.LinAlgError, MemoryError) as error:
@@ -155,7 +163,7 @@ def _add_doubt(result: BatchResult, cov: Array) -> list[str]:
 
 
 def _without_drift(result: BatchResult) -> tuple[BatchResult, list[str]]:
-    """Take back what a drift that is left out did to heading and velocity; return a warning, too, where that fails."""
+    """Take back what a left-out drift did to heading and velocity; also return a warning where that fails."""
     try:
         return with_drift_taken_back(result), []
     except (RuntimeError, MemoryError) as error:
@@ -165,7 +173,7 @@ def _without_drift(result: BatchResult) -> tuple[BatchResult, list[str]]:
 
 
 def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
-    """Add what slow errors that are left out do to attitude and velocity; return a warning where that fails."""
+    """Add what left-out slow errors do to attitude and velocity; return a warning where that fails."""
     try:
         more = unmodelled(result)
     except RuntimeError as error:
@@ -178,7 +186,7 @@ def _add_unmodelled(result: BatchResult, cov: Array, v_cov: Array) -> list[str]:
 
 
 def _add_mount(result: BatchResult, R: Array, cov: Array, v_cov: Array) -> list[str]:
-    """Add what is not known of the IMU's mount; return a warning where that fails, or where the mount is far from what is configured."""
+    """Add what is unknown of the IMU's mount; return a warning where that fails, or where the mount is far off."""
     problem = result.problem
     try:
         found = result.mount or mount_error(problem, result.graph, result.values, result.verdicts, result.prior)
@@ -192,8 +200,12 @@ def _add_mount(result: BatchResult, R: Array, cov: Array, v_cov: Array) -> list[
 
 
 def _add_others(result: BatchResult, cov: Array) -> list[str]:
-    """State the heading as uncertain as other headings that explain the motion make it; return a warning where it is a guess."""
-    # Turns or a sensor after the first window.
+    """Raise the uncertainty of the heading to what the other headings that explain the motion make it.
+
+    Returns:
+        A warning if the heading is a guess.
+    """
+    # After the first window, turns or a sensor may tell the heading.
     told = (np.arange(len(cov)) > result.begun) & (cov[:, 5, 5] < _TOLD_RAD**2)
     var = np.where(told, 0.0, result.heading_var)
     widen_heading(cov, var)
@@ -207,9 +219,10 @@ def _add_others(result: BatchResult, cov: Array) -> list[str]:
 
 
 def _add_guess(result: BatchResult, cov: Array) -> list[str]:
-    """Where no heading is measured and the vessel stays in place, state it as unknown, and return a warning; nothing where waves show it.
+    """State the heading as unknown, and return a warning, where no sensor measures it and the vessel stays in place.
 
-    About the heading that is assumed then, the linearised run is as sure as its biases allow: to 25 deg.
+    Nothing is done where waves show the heading. Linearised about the heading that is assumed, the run is as sure as
+    its biases allow: to 25 deg.
     """
     if result.headings or float(cov[:, 5, 5].min()) < _SHOWN_RAD**2:
         return []
@@ -220,7 +233,7 @@ def _add_guess(result: BatchResult, cov: Array) -> list[str]:
 
 
 def _berth_tracks(problem: Problem, result: BatchResult, trajectory: Trajectory) -> Iterator[BerthTrack]:
-    """The vessel seen from each berth that is near."""
+    """Yield the track of the vessel as seen from each berth that it comes near."""
     for stream in problem.streams:
         for berth in stream.row.berths(stream.config):
             near = np.linalg.norm(trajectory.p_world_m[:, :2] - berth.point_m[:2], axis=1) < _NEAR_BERTH_M
@@ -236,11 +249,11 @@ def _berth_tracks(problem: Problem, result: BatchResult, trajectory: Trajectory)
             yield BerthTrack(berth=berth, stamps_ns=stamps, value=value, rate=rate, cov=cov)
 
 
-_IN_PLANE = np.array([0, 1, 2, 5])  # of a berth's motion: its roll and pitch do not show
+_IN_PLANE = np.array([0, 1, 2, 5])  # axes of a berth's motion that are used: roll and pitch do not show
 
 
 def _moved(problem: Problem, result: BatchResult, stream: Stream, berth: Berth, stamps: NDArray[np.int64]) -> Array:
-    """How a berth has moved (N, 4) at N stamps; between two of its slow nodes it is in between."""
+    """Return how a berth has moved (N, 4), east, north, up, psi, at N stamps, interpolated between slow nodes."""
     if berth.moves is None:
         return np.zeros((len(stamps), 4))
     at = problem.timeline.slow_stamps_ns
@@ -252,7 +265,10 @@ def _moved(problem: Problem, result: BatchResult, stream: Stream, berth: Berth, 
 def _of_pose_and_berth(
     problem: Problem, result: BatchResult, stream: Stream, berth: Berth, states: NDArray[np.int64]
 ) -> Array:
-    """Covariances (N, 7, 7) of east, north, yaw of the body and of how the berth has moved: known together, not apart."""
+    """Return joint covariances (N, 7, 7) of east, north, yaw of the body and of how the berth has moved.
+
+    The two are known together better than each by itself.
+    """
     poses = [keys.pose(k) for k in states.tolist()]
     R = [result.values.atPose3(key).rotation().matrix() for key in poses]
     if berth.moves is None:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Standstill of the vessel, and the gyroscope's bias: from it, or from the difference between headings and integrated rates."""
+"""Standstill of the vessel, and the bias of the gyroscope.
+
+The bias is known from standstill, or from the difference between headings and integrated rates.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +16,19 @@ from graphloc.frames import Array
 from graphloc.signals.series import runs
 from graphloc.time import duration_ns
 
-_STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # spread at standstill, engine running
-_STILL_SPEED_MPS = 0.15  # by the fixes, besides what their noise makes: a moored vessel surges on its lines; a choice
-_FEWEST_HEADINGS = 4  # of a standstill, that show a turn
+_STILL_GYRO_RADPS, _STILL_ACCEL_MPS2 = 0.03, 0.3  # most spread at standstill, engine running
+_STILL_SPEED_MPS = 0.15  # most speed by the fixes, besides what their noise makes: a moored vessel surges; a choice
+_FEWEST_HEADINGS = 4  # fewest headings of a standstill that show a turn
 _BLOCK_S, _SWELL_S = 0.5, 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Positions in world, moved from antenna to body as far as that needs no attitude: t (M,), s; p (M, 3), m; sigma (M, 3), m."""
+    """Positions in world, moved from antenna to body as far as that needs no attitude.
+
+    Attributes:
+        t: (M,) s. p: (M, 3) m. sigma: (M, 3) m.
+    """
 
     t: Array
     p: Array
@@ -29,7 +36,7 @@ class Track:
 
 
 def samples_of(problem: Problem, start_s: float, stop_s: float) -> tuple[Array, Array, Array]:
-    """Return t (M,) s, specific force and rate (M, 3) in body axes over a span."""
+    """Return t (M,), s, specific force and rate (M, 3), body axes, of the IMU's samples in a span."""
     origin = problem.imu.stamps_ns[0]
     lo, hi = np.searchsorted(problem.imu.stamps_ns, [origin + duration_ns(start_s), origin + duration_ns(stop_s)])
     hi = max(int(hi), int(lo) + 2)
@@ -39,7 +46,7 @@ def samples_of(problem: Problem, start_s: float, stop_s: float) -> tuple[Array, 
 
 
 def standstill(problem: Problem, track: Track, yaws: dict[str, Array]) -> tuple[float, float] | None:
-    """Return the longest stretch of the run (at least 3 s) without rotation, acceleration or vibration."""
+    """Return the longest stretch (begin, end; s) without rotation, acceleration or vibration; None if none has 3 s."""
     span = float((problem.imu.stamps_ns[-1] - problem.imu.stamps_ns[0]) * 1e-9)
     t, f, w = samples_of(problem, 0.0, span)
     block = np.floor(t).astype(np.int64)
@@ -58,7 +65,7 @@ def standstill(problem: Problem, track: Track, yaws: dict[str, Array]) -> tuple[
 
 
 def _rests(track: Track, yaws: dict[str, Array], first: float, last: float) -> bool:
-    """Whether positions and headings confirm that a quiet stretch is standstill, and no steady motion or turn."""
+    """Return whether positions and headings confirm that a quiet stretch is standstill, no steady motion or turn."""
     inside = (track.t >= first) & (track.t <= last)
     if inside.sum() < 4 or np.ptp(track.t[inside]) < 0.5 * (last - first):
         return False
@@ -81,13 +88,13 @@ def _within(rows: Array, first: float, last: float) -> Array:
 
 
 def _headed(yaws: dict[str, Array], first: float, last: float) -> bool:
-    """Whether a sensor tells the heading through a stretch, and with it any turn."""
+    """Return whether a sensor measures the heading through a stretch, and so would show a turn."""
     found = (_within(rows, first, last) for rows in yaws.values())
     return any(len(rows) >= _FEWEST_HEADINGS and np.ptp(rows[:, 0]) > 0.5 * (last - first) for rows in found)
 
 
 def slope_of(t: Array, y: Array) -> float:
-    """Return the Theil-Sen slope: the median over pairs that are far enough apart."""
+    """Return the slope of y over t by Theil-Sen: the median over pairs that are far enough apart."""
     n = len(t)
     i = np.arange(n)
     j = (i + max(n // 2, 1)) % n
@@ -99,7 +106,13 @@ def slope_of(t: Array, y: Array) -> float:
 def gyro_bias(
     problem: Problem, window: float, still: tuple[float, float] | None, yaws: dict[str, Array]
 ) -> tuple[Array, Array, tuple[str, ...]]:
-    """Bias (3,) in body axes and its sigma (3,), rad/s: of each axis from standstill or from motion, whichever tells it better."""
+    """Return the gyroscope's bias (3,) in body axes and its sigma (3,), rad/s, and notes.
+
+    Each axis is from standstill or from motion, whichever tells it better.
+
+    Args:
+        window: length of the first window, s. still: a standstill (begin, end), s. yaws: headings (M, 3) by sensor.
+    """
     prior = problem.links.bias_sigmas()[3:]
     t, _, w = samples_of(problem, 0.0, window)
     span = float(np.ptp(t))
@@ -133,11 +146,12 @@ def _bias_at_rest(t: Array, w: Array, prior: Array, *, turns: bool) -> tuple[Arr
     """Return the bias (3,) and its sigma (3,), rad/s, by the rates (M, 3) of a standstill.
 
     Args:
-        prior: (3,) sigma of the bias, rad/s. turns: whether the vessel may turn on the spot, as no heading tells that it does not.
+        prior: (3,) sigma of the bias, rad/s.
+        turns: whether the vessel may turn on the spot, because no heading says that it does not.
     """
     bias = w.mean(axis=0)
     sigma = np.minimum(w.std(axis=0) / np.sqrt(len(w)) + 3e-4 + _swell(t, w), prior)
-    if turns:  # any part of the mean rate is bias, as far as the prior has it
+    if turns:  # any part of the mean rate may be bias, up to what its prior allows
         half = bias[2] / 2.0
         share = prior[2] ** 2 / (prior[2] ** 2 + half**2)
         bias[2], sigma[2] = share * half, np.hypot(sigma[2], np.sqrt(share) * half)
@@ -147,8 +161,8 @@ def _bias_at_rest(t: Array, w: Array, prior: Array, *, turns: bool) -> tuple[Arr
 def _swell(t: Array, w: Array) -> Array:
     """Return how far (3,), rad/s, the mean rate of a quiet stretch may be from zero because of slow waves.
 
-    Three quiet seconds are half a period of swell, whose rates do not average out: the mean may be off by as much as means over half
-    a second scatter, and by less only where the stretch is longer than wave periods.
+    Three quiet seconds are half a period of swell, whose rates do not average out. So the mean may be off by as much as
+    means over half a second scatter, and by less only where the stretch is longer than wave periods.
     """
     block = np.floor((t - t[0]) / _BLOCK_S).astype(np.int64)
     starts = np.flatnonzero(np.diff(block, prepend=-1))  # a gap may leave blocks empty

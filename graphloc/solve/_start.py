@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The start of a run: candidates for the heading are tried on its first window, which grows while they cannot be told apart.
+"""The start of a run: candidates for the heading are tried on its first window, which grows until one is left.
 
-Where no sensor tells the heading, the accelerations do, turned by it into the motion that the positions show. Linearised about
-the heading that explains their noise best, and with a prior there, a run is too sure of it: on a robot that drove straight for
-120 s with a noisy IMU it stated 20 deg, 1 sigma, and was 95 deg off, at a cost that differed by 1.3 from that of the true heading.
-So the window grows until headings beside the best one cost clearly more; where none ever do, the heading is as uncertain as the
-costs of all headings say.
+Where no sensor measures the heading, the accelerations tell it: turned by the right heading, they give the motion that
+the positions show. Linearised about the heading that explains their noise best, and with a prior there, a run is too
+sure of it: on a robot that drove straight for 120 s with a noisy IMU it stated 20 deg, 1 sigma, and was 95 deg off, at
+a cost that differed by 1.3 from that of the true heading. So the window grows until headings beside the best one cost
+clearly more. Where none ever do, the heading is as uncertain as the costs of all headings say.
 """
 
 from __future__ import annotations
@@ -29,29 +29,34 @@ from graphloc.solve.decide import Stage, cost_of_noise, decisions, weigh
 from graphloc.solve.stretch import copy_states, dead_reckon, fill_slow, solve_stretch
 from graphloc.time import duration_ns
 
-# Starts that cost this much more (log-likelihood) are dropped; while several remain, the window grows.
+# Starts that cost this much more (log-likelihood) are dropped. While several remain, the window grows up to a length:
+# that where sensors tell the heading, or that where only the motion does.
 _COST_APART, _LONGEST_S, _LONGEST_UNTOLD_S = 8.0, 60.0, 600.0
-_STEP_NS = 15_000_000_000  # most that a candidate is dead-reckoned before it is solved again
-_WHOLE_NS = (
-    60_000_000_000  # from its start; later steps take what is before them as known, and all of it is solved at the end
-)
-_PLACE_S, _LATE_PLACE_S = 5.0, 90.0  # of positions in the first window; latest time of the first one
-# Stages of the first window: name, most rounds, motion in m that ends it, whether hypotheses are weighed.
+_STEP_NS = 15_000_000_000  # longest time that a candidate is dead-reckoned before it is solved again
+# From its start up to here, a candidate is solved as a whole at each step. Later steps take what is before them as
+# known, and all of it is solved at the end.
+_WHOLE_NS = 60_000_000_000
+# Time with positions at the end of the first window; longest window that this may make.
+_PLACE_S, _LATE_PLACE_S = 5.0, 90.0
+# Stages of the first window: name, most rounds, motion (m) below which it ends, whether hypotheses are weighed.
 _STAGES = ((Stage.FAR, 8, 0.5, False), (Stage.OPEN, 2, 0.5, False), (Stage.FINAL, 2, 0.5, True))
-# What stands for all headings: turned from the best one by angles, and how much of the circle each stands for; the best: 30 deg.
+# Other headings than the best one, which stand for all: angles from it, and how much of the circle each stands for. The
+# best one stands for 30 deg.
 _OTHERS_RAD = np.radians([-30.0, 30.0, -60.0, 60.0, -120.0, 120.0, 180.0])
 _WIDTHS_RAD = np.radians([30.0, 30.0, 45.0, 45.0, 60.0, 60.0, 60.0])
-_HELD_RAD = np.radians(3.0)  # 1 sigma that holds them there
+_HELD_RAD = np.radians(3.0)  # 1 sigma that holds a heading
 _FREE = 1e4  # 1 sigma, m or rad, of what is not held
 
 
 class Begun(NamedTuple):
-    """The start of a run: values, prior, the last state solved, iterations, how many headings explain it, and what it was aligned to.
+    """The start of a run.
 
-    `excess`: its cost over what is expected, at least 1.
-
-    `heading_var`: (last + 1,), rad^2, of each state, from how much other headings cost (at both ends, linear in between); 0 where the
-    motion excludes those beside the solved one, or a sensor tells it.
+    Attributes:
+        values, prior: estimate, and prior on the first state. last: the last state solved.
+        iterations: number of those that it took. headings: number of candidates that explain it about equally well.
+        heading_var: (last + 1,), rad^2, of each state, from how much other headings cost (at both ends, linear in
+            between); 0 where the motion excludes the headings beside the solved one, or a sensor tells it.
+        start: what it was aligned to. excess: its cost over what is expected, at least 1.
     """
 
     values: gtsam.Values
@@ -70,8 +75,8 @@ def solve_start(
     """Try each candidate on the first window; look further while several explain it; keep the cheapest.
 
     Args:
-        newest: `heading_var` is asked for at the last state alone; it is that of all.
-        window_s: look no further than this, even where several explain it; by default as far as is needed.
+        newest: whether `heading_var` is asked for at the last state alone; all states then have that.
+        window_s: look no further than this, even where several candidates explain it; by default as far as is needed.
     """
     seconds, iterations, until = max(window_s or start.window_s, _placed_s(problem)), 0, 0
     longest_s = window_s or (_LONGEST_UNTOLD_S if start.by_motion else _LONGEST_S)
@@ -83,7 +88,8 @@ def solve_start(
         told_apart, last_window = len(candidates) == 1, seconds >= longest_s or until == len(problem.timeline) - 1
         if start.by_motion:
             for candidate in candidates if start.tried else ():
-                # A prior about a heading that was only tried is no information: the candidates may go where the motion takes them.
+                # A prior about a heading that was only tried is no information: candidates may go where the motion
+                # leads.
                 candidate.prior = _start_prior(problem, start, _first_yaw(candidate.values))
         best, beside = candidates[0], list[float]()
         if start.by_motion and told_apart:
@@ -103,7 +109,7 @@ def solve_start(
 def _extended(
     problem: Problem, candidates: Sequence[_Candidate], known: int, until: int, progress: Progress
 ) -> tuple[list[_Candidate], int]:
-    """Extend candidates to a state; return those that can be extended, the cheapest first, and the iterations.
+    """Extend candidates to state `until`; return those that can be extended, the cheapest first, and the iterations.
 
     Raises:
         SolveError: there is none.
@@ -125,8 +131,8 @@ def _extended(
 def _placed_s(problem: Problem) -> float:
     """Return how long (s) the first window must be to contain a position measurement; 0 where none comes soon.
 
-    Without one the next window would be dead reckoning with poorly known biases: after 15 s it may be 300 m off, and tags cannot be
-    judged by such a prediction.
+    Without one the next window would be dead reckoning with poorly known biases. After 15 s that may be 300 m off, and
+    tags cannot be judged by such a prediction.
     """
     stamps = problem.timeline.stamps_ns
     first_ns = [s.measurements[0].stamp_ns for s in problem.streams if s.row.absolute and s.measurements]
@@ -136,7 +142,12 @@ def _placed_s(problem: Problem) -> float:
 
 @dataclass(slots=True)
 class _Candidate:
-    """One start: its estimate, prior and cost so far; `excess`: cost over what is expected, at least 1."""
+    """One candidate for the start.
+
+    Attributes:
+        values: its estimate. prior: on the first state. cost: so far, nats. excess: cost over what is expected, at
+            least 1.
+    """
 
     values: gtsam.Values
     prior: StartPrior
@@ -173,7 +184,10 @@ def _start_prior(problem: Problem, start: Start, yaw: float) -> StartPrior:
 
 
 def _different(ranked: list[_Candidate]) -> list[_Candidate]:
-    """Drop candidates that cost clearly more than the cheapest, or have converged to the heading of a cheaper one."""
+    """Return the candidates, the cheapest first, that are worth keeping.
+
+    Dropped are those that cost clearly more than the cheapest, or have converged to the heading of a cheaper one.
+    """
     kept: list[_Candidate] = []
     for candidate in ranked:
         yaw = _first_yaw(candidate.values)
@@ -193,7 +207,7 @@ def _excluded(best: _Candidate) -> float:
 
 
 def _costs_beside(problem: Problem, start: Start, best: _Candidate, last: int) -> list[float]:
-    """Return the costs of the headings at state `last` beside the best one, up to the first that the motion does not exclude."""
+    """Return the costs of headings at state `last` beside the best one, up to the first that is not excluded."""
     costs: list[float] = []
     for by_rad in _OTHERS_RAD[:2].tolist():
         costs.append(_held(problem, start, best, last, last, by_rad).cost)
@@ -203,10 +217,10 @@ def _costs_beside(problem: Problem, start: Start, best: _Candidate, last: int) -
 
 
 def _var_at(problem: Problem, start: Start, best: _Candidate, last: int, at: int, known: Sequence[float] = ()) -> float:
-    """Return the variance, rad^2, of the heading of a state, from how much others cost: about 0 where these cost much more.
+    """Return the variance, rad^2, of the heading of state `at`, from what other headings cost: near 0 if much more.
 
     Args:
-        known: costs of the first of the others.
+        known: costs of the first of the other headings, where they are known.
     """
     others = [_held(problem, start, best, last, at, by_rad).cost for by_rad in _OTHERS_RAD[len(known) :].tolist()]
     cost = np.array([*known, *others])
@@ -215,7 +229,7 @@ def _var_at(problem: Problem, start: Start, best: _Candidate, last: int, at: int
 
 
 def _held(problem: Problem, start: Start, best: _Candidate, last: int, at: int, by_rad: float) -> _Candidate:
-    """Return the run solved with the heading of state `at` held at that of `best` turned by an angle."""
+    """Return the run solved with the heading of state `at` held at that of `best`, turned by an angle."""
     turn, values = gtsam.Rot3.Yaw(by_rad), copy_states(problem, best.values, 0, last)
     for k in range(last + 1):
         pose = values.atPose3(keys.pose(k))
@@ -237,8 +251,9 @@ def _held(problem: Problem, start: Start, best: _Candidate, last: int, at: int, 
 def _extend(problem: Problem, candidate: _Candidate, known: int, until: int) -> int:
     """Take a candidate from state `known` to `until`, in place, a step at a time; return the iterations.
 
-    Dead-reckoned at once over a minute, with biases not known yet, it would be kilometres off, where nothing leads back. And solved from
-    its start at each step, a vessel that lies still for ten minutes would take minutes for each candidate.
+    Dead-reckoned at once over a minute, with biases not known yet, it would be kilometres off, where nothing leads
+    back. If all steps were solved from its start, a vessel that lies still for ten minutes would take minutes for each
+    candidate.
     """
     stamps, iterations = problem.timeline.stamps_ns, 0
     whole = problem.timeline.floor(int(stamps[0]) + _WHOLE_NS)
@@ -255,7 +270,11 @@ def _extend(problem: Problem, candidate: _Candidate, known: int, until: int) -> 
 def _solve_candidate(
     problem: Problem, candidate: _Candidate, last: int, held: gtsam.NonlinearFactor | None = None
 ) -> int:
-    """Solve the first window in place; return the iterations. `held`: a factor that holds it near an estimate; else gently first."""
+    """Solve the first window in place; return the iterations.
+
+    Args:
+        held: a factor that holds the window near an estimate; None: it is solved with gentle losses first.
+    """
     iterations = 0
     for stage, limit, settled_m, hypotheses in _STAGES[0 if held is None else 1 :]:
         for _ in range(limit):

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start alignment: attitude, heading, position, velocity and gyro bias from the first seconds.
 
-It uses a window, never a single measurement: gyro bias from standstill, or from the difference between headings and integrated
-rates; roll and pitch from the mean specific force in a frame propagated by the gyroscope; heading from poses, compass or
-course. Where headings disagree, or none is known, there are several candidates, and the solver tries each.
+It uses a window, never a single measurement: gyro bias from standstill, or from the difference between headings and
+integrated rates; roll and pitch from the mean specific force in a frame propagated by the gyroscope; heading from
+poses, compass or course. If headings disagree, or none is known, there are several candidates, and the solver tries
+each.
 """
 
 from __future__ import annotations
@@ -24,16 +25,17 @@ from graphloc.graph import Hint, SlowProcess
 from graphloc.solve._standstill import Track, gyro_bias, samples_of, slope_of, standstill
 from graphloc.time import utc_text
 
-_USUAL_SPEED_MPS = 10.0  # 1 sigma, where the speed is unknown
-_CARRIED_RAD = np.radians(20.0)  # error by gyro bias, 1 sigma: from later on, a heading is no longer one of the start
+_USUAL_SPEED_MPS = 10.0  # 1 sigma of the speed, where it is unknown
+_CARRIED_RAD = np.radians(20.0)  # 1 sigma by gyro bias, from which a later heading tells nothing of the start
 _OWN_TILT_RAD = 0.5  # 1 sigma of roll and pitch, without accelerometer data
-# Travel from which the motion may tell the heading, by how far places are off (noise, and drift of their slow error).
-_MANY = 20.0  # times that: the travel that is waited for
-_FEW = 5.0  # times that: enough beyond `_USUAL_M`, and where the vessel never goes farther and nothing else tells the heading
-_DRIFT_S = 30.0  # in which a slow error drifts
-_LEAST_M = 1.0  # by less an antenna sways
+# Travel from which the motion may tell the heading, in times of how far positions are off (noise, and drift of their
+# slow error).
+_MANY = 20.0  # the travel that is waited for, up to `_USUAL_M`
+_FEW = 5.0  # the least travel: enough where the vessel never goes farther and nothing else tells the heading
+_DRIFT_S = 30.0  # time over which a slow error counts as drift
+_LEAST_M = 1.0  # an antenna sways by less
 _USUAL_M = 15.0  # more is not waited for, unless `_FEW` asks for it
-_LATEST_S = 120.0  # up to which few are enough where there never is more: later, fixes have drifted as far
+_LATEST_S = 120.0  # latest time of `_FEW`, where `_MANY` never comes: later, fixes have drifted as far
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,9 +43,12 @@ class Start:
     """A start: level attitude without heading, and candidates for the heading.
 
     Attributes:
-        R_level_body: (3, 3) attitude with yaw 0. tilt_sigma_rad: of roll and pitch, where there is no `level`.
-        yaws_rad: candidates. yaw_sigma_rad: of each (wide where it is a guess). by_motion: no sensor tells the heading, the motion may.
-        tried: the candidates are only tried, and no information.
+        R_level_body: (3, 3) attitude with yaw 0. tilt_sigma_rad: sigma of its roll and pitch in the prior on the pose
+            (wide beside a `level`).
+        level: levelling factor; None: there is none.
+        yaws_rad: candidates. yaw_sigma_rad: of each (wide where it is a guess).
+        by_motion: whether no sensor tells the heading, but the motion may.
+        tried: whether the candidates are only tried, so that they carry no information.
         p_world_m, p_sigma_m, v_world_mps, v_sigma_mps: (3,) each.
         gyro_bias_radps, gyro_bias_sigma_radps: (3,) in IMU axes.
         window_s: span over which the candidates must be distinguished.
@@ -67,7 +72,10 @@ class Start:
     notes: tuple[str, ...]
 
     def near(self, yaw_rad: float) -> Start:
-        """Return it with one candidate of those that are only tried, where it is about known; the same where a sensor tells it."""
+        """Return the start with a single candidate, where its own are only tried and the motion may tell the heading.
+
+        Else it is unchanged.
+        """
         if not (self.tried and self.by_motion):
             return self
         note = "heading from the motion alone, one start heading tried"
@@ -123,10 +131,11 @@ def _heading_told_by(
     yaws: dict[str, Array],
     drift_radps: float,
 ) -> tuple[dict[str, Array], float | None]:
-    """Return the measurements of heading that tell it at the start, and when (s) the vessel has moved far enough to tell it; None: it has not.
+    """Return the headings, by sensor, that tell the heading at the start, and when (s) the motion may tell it.
 
-    The gyroscope carries late ones back to the start, with a bias that is known to `drift_radps`: they are left out where others, or the
-    motion, tell the heading before.
+    The motion may once the vessel has moved far enough; None: it never does. The gyroscope carries late headings back
+    to the start, with a bias that is known to `drift_radps`: they are left out where earlier headings, or the motion,
+    tell it.
     """
     early = {name: rows for name, rows in yaws.items() if rows[0, 0] * drift_radps < _CARRIED_RAD}
     noises = [(np.array([h.p_sigma_m[:2] for _, h in hints[stream.name]]), stream.row.slow(stream.config))
@@ -172,7 +181,11 @@ def _yaws(hints: dict[str, list[tuple[float, Hint]]]) -> dict[str, Array]:
 
 
 def _turns(problem: Problem, span_s: float, bias: Array) -> Callable[[float], Array]:
-    """Return a function t (s) -> R_body0_body(t) (3, 3), integrated from the gyroscope over the beginning of the run."""
+    """Return a function t (s) -> R_body0_body(t) (3, 3), integrated from the gyroscope from the run's begin.
+
+    Args:
+        span_s: longest t. bias: (3,) rad/s, body axes.
+    """
     span = float((problem.imu.stamps_ns[-1] - problem.imu.stamps_ns[0]) * 1e-9)
     t, _, w = samples_of(problem, 0.0, min(span_s, span))
     R = np.empty((len(t), 3, 3))
@@ -193,12 +206,13 @@ def _level(
     """Return roll and pitch at the start as R (3, 3) with yaw 0, their sigma, the levelling factor, and a note.
 
     Args:
+        window: length of the first window, s. still: a standstill (begin, end) at the start, s.
         turn: t -> R_body0_body(t), by the gyroscope less its bias (3,), in body axes.
     """
     if problem.config.sensors[problem.imu.sensor].gravity == "removed":
         return np.eye(3), 0.1, None, "roll and pitch unknown (gravity removed by the driver): taken level"
     t, f, _ = samples_of(problem, 0.0, still[1] if still else min(window, 10.0))
-    span = float(np.ptp(t))  # online, a start comes before ten seconds have
+    span = float(np.ptp(t))  # online, the run may be shorter than ten seconds
     R = np.array([turn(s) for s in t])
     forces = np.einsum("nij,nj->ni", R, f)
     force = float(np.linalg.norm(forces.mean(axis=0)))
@@ -222,7 +236,7 @@ def _level(
 def _headings(
     problem: Problem, yaws: dict[str, Array], turn: Callable[[float], Array], moved_s: float | None
 ) -> tuple[tuple[float, ...], float, float, str]:
-    """Return candidates for the yaw at the start, their sigma, the span that distinguishes them, and a note."""
+    """Return candidates for the yaw at the start, their sigma, the span (s) that distinguishes them, and a note."""
     config = problem.config.start
     candidates: list[float] = []
     sources = []
@@ -257,14 +271,14 @@ def _headings(
 
 
 def wanted_travel_m(noises: Sequence[tuple[Array, SlowProcess | None]]) -> tuple[float, float]:
-    """Return the travel, m, from which the motion may tell a heading that no sensor measures, and that of a craft which goes no farther.
+    """Return the travel, m, from which the motion may tell a heading that no sensor measures, and the least one.
 
-    By a twentieth of it the places are off, or drift meanwhile: a course by two of them is good to 4 deg. 15 m are enough as long as
-    that is no more than a fifth, and a fifth is all that one needs which circles in less. How well a motion tells it is seen once it
-    is solved.
+    Positions are off by their noise, and by drift meanwhile. After twenty times that, a course by two positions is good
+    to 4 deg. No more than 15 m are waited for, if these are five times or more; and five times are enough for a craft
+    that never goes farther, but circles. How well a motion tells the heading is seen once it is solved.
 
     Args:
-        noises: of each sensor, sigma (N, 2) of its places, m, NaN where it tells none; and its slow error.
+        noises: of each sensor, sigma (N, 2) of its positions, m, NaN where it gives none; and its slow error.
     """
     off = []
     for sigma_m, slow in noises:
@@ -316,7 +330,7 @@ def _position_and_velocity(
         v0[:2], unsure = share * slope, float(np.sqrt(share)) * noise
     v_sigma = np.full(3, 0.2 if still else float(np.hypot(3.0, unsure)))
     v_sigma[2] = 0.2 if still else 1.0
-    # Extrapolated back to the first state in a straight line: the motion before the first position is unknown.
+    # Extrapolated back to the first state in a straight line, as the motion before the first position is unknown.
     back_s = max(float(np.median(track.t[near])), 0.0)
     p0[:2] -= v0[:2] * back_s
     sigma = np.full(3, 10.0) + 3.0 * np.nan_to_num(track.sigma[near], nan=5.0).max(axis=0)

@@ -2,21 +2,23 @@
 """The offline solver: align, grow, then decide over the whole run.
 
 1. Align over a window; try each candidate heading on it and keep the cheapest (`alignment`, `_start`).
-2. Grow the solved part by some seconds at a time. Each window is solved with a prior from earlier data; hypotheses that are
-   new in it are judged by the prediction without them, with its covariance (`_grow`). Steps 1 and 2 use a thinned run
-   (`graphloc.build.thinned`). Passes over all of it then remove the seams between windows, at a fifth of the cost.
+2. Grow the solved part by some seconds at a time. Each window is solved with a prior from earlier data; hypotheses that
+   are new in it are judged by the prediction without them, with its covariance (`_grow`). Steps 1 and 2 use a thinned
+   run (`graphloc.build.thinned`). Passes over all of it then remove the seams between windows, at a fifth of the cost.
 3. Pass over the whole run, re-choosing modes and weights, until they no longer change (`_passes`).
-4. Try other choices that may be more probable (`_choices`), and repeat 3 where one is. Repeat 1 to 4 with position jumps of the only
-   position sensor, where the solution shows some (`_jumps`), and without the first fixes after an outage, where these bend the
-   track (`_returns`). Repeat 3 with the IMU's mount turned, where it is clearly off (`imu_mount`).
+4. Try other choices that may be more probable (`_choices`), and repeat 3 where one is. Repeat 1 to 4 with position
+   jumps of the only position sensor, where the solution shows some (`_jumps`), and without the first fixes after an
+   outage, where these bend the track (`_returns`). Repeat 3 with the IMU's mount turned, where it is clearly off
+   (`imu_mount`).
 5. Where receivers jump and no other sensor measures position, choose the most probable level (`_levels`).
 6. Compute the covariances of every state from the last graph (`_marginals`).
 
 Where no sensor measures position or velocity for a while, 3 to 6 include the motion model (`graphloc.motion_model`).
-Where sensors scatter more than they state, 3 and 4 are repeated with the scatter as their noise.
-Where the IMU contradicts the other sensors, or a sensor of heading or velocity disagrees for long, 1 to 4 are tried without such a
-sensor, and repeated with all sensors from that solution. Where the IMU still contradicts the others, its noise is scaled up, and 3 and
-4 are repeated, beginning with gentle losses. If that explains little, the IMU is not to blame, and its noise stays as configured.
+Where sensors scatter more than they state, 3 and 4 are repeated with the scatter as their noise. Where the IMU
+contradicts the other sensors, or a sensor of heading or velocity disagrees for long, 1 to 4 are tried without such a
+sensor, and repeated with all sensors from that solution. Where the IMU still contradicts the others, its noise is
+scaled up, and 3 and 4 are repeated, beginning with gentle losses. If that explains little, the IMU is not to blame, and
+its noise stays as configured.
 """
 
 from __future__ import annotations
@@ -46,8 +48,9 @@ from graphloc.solve.imu_noise import CONTRADICTION, noise_step, with_needed_nois
 from graphloc.solve.sensor_noise import scattering
 
 _MAX_NOISE_ROUNDS, _MAX_JUMP_ROUNDS, _MAX_WALK_ROUNDS = 4, 2, 3
-# Nats by which each jump must make a run more probable. To say at which of a thousand fixes it is, and to which of a hundred places along
-# each of two axes it leads, takes 16. In 25 of 27 runs with jumps each gave over 30; between high houses, where fixes wander, 15 to 20.
+# Nats by which each jump must make a run more probable. To say at which of a thousand fixes it is, and to which of a
+# hundred places along each of two axes it leads, takes 16. In 25 of 27 runs with jumps each gave over 30; between high
+# houses, where fixes wander, 15 to 20.
 _OF_A_JUMP = 25.0
 _OPEN_PASSES = 4  # most passes with each gentle loss, after the IMU's noise has changed
 # More noise of the IMU explains a misfit if that falls below what counts as a contradiction, or by this factor.
@@ -56,29 +59,46 @@ _EXPLAINED = 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchResult:
-    """The solved graph, before it is turned into a `Solution`."""
+    """The solved graph, before it is turned into a `Solution`.
 
-    problem: Problem  # with the noise that it was solved with
-    stated: Problem  # with the noise as configured
+    Attributes:
+        problem: with the noise that it was solved with. stated: with the noise as configured.
+        values, verdicts: the solution. cov: of each key. graph: of the last step.
+        passes, iterations: number of those that it took.
+        cost: twice the graph's cost, without outliers: a chi-square where the model holds.
+        converged: whether the last pass hardly changed the solution. noise_scale: factor on the IMU's configured noise.
+        prior: on the first state.
+        headings: number of candidate headings that explain the start about equally well; 0: nothing tells the heading
+            there.
+        heading_var: (N,) rad^2 to add to the heading of each state, as the motion does not exclude other headings (see
+            `_start`).
+        begun: last state of the first window: `heading_var` knows nothing of later data.
+        levels_cov: (N, 3, 3) m^2 to add to the positions, as other levels may be the usual ones (see `_levels`).
+        mount: how far the IMU is off its mount (see `imu_mount`); None: not estimated for this graph.
+        notes: what the alignment at the start is based on.
+    """
+
+    problem: Problem
+    stated: Problem
     values: gtsam.Values
     verdicts: Verdicts
-    cov: dict[int, Array]  # of each key
+    cov: dict[int, Array]
     graph: gtsam.NonlinearFactorGraph
     passes: int
     iterations: int
-    cost: float  # 2 x the graph's cost, without outliers: a chi-square where the model holds
+    cost: float
     converged: bool
     noise_scale: float
     prior: StartPrior
-    headings: int  # number of candidate headings that explain the start about equally well; 0: nothing tells the heading there
-    heading_var: Array  # (N,) rad^2 to add to the heading of each state, as the motion does not exclude other headings (see `_start`)
-    begun: int  # last state of the first window: `heading_var` knows nothing of later data
-    levels_cov: Array  # (N, 3, 3) m^2 to add to the positions, as other levels may be the usual ones (see `_levels`)
-    mount: MountError | None  # how far the IMU is off its mount (see `imu_mount`); None: not estimated for this graph
+    headings: int
+    heading_var: Array
+    begun: int
+    levels_cov: Array
+    mount: MountError | None
     notes: tuple[str, ...]
 
     def lightened(self) -> BatchResult:
-        """Return the same without the graph, which takes gigabytes on a run of hours."""
+        """Return the result without the graph, which takes gigabytes on a run of hours."""
         return replace(self, graph=gtsam.NonlinearFactorGraph())
 
 
@@ -94,11 +114,12 @@ def solve_batch(
     """Solve a whole run.
 
     Args:
-        newest: whether only the last state is of interest, as for a start of the online mode: `heading_var` is then that of the last
-            state, and jumps, returns after outages and the IMU's mount are not looked for.
-        doubt_imu: whether to look for spans in which the IMU is wrong. doubt_returns: whether to look for fixes after outages that
-            lead the track astray.
-        near_rad: yaw at the start, rad: the only candidate where the motion alone tells the heading; None: all are tried.
+        newest: whether only the last state is of interest, as for a start of the online mode: `heading_var` is then
+            that of the last state, and jumps, returns after outages and the IMU's mount are not looked for.
+        doubt_imu: whether to look for spans in which the IMU is wrong. doubt_returns: whether to look for fixes after
+            outages that lead the track astray.
+        near_rad: yaw at the start, rad: the only candidate where the motion alone tells the heading; None: all are
+            tried.
 
     Raises:
         ImuWrong: there are spans in which the IMU is wrong.
@@ -124,7 +145,8 @@ def solve_batch(
 class _Underway:
     """A run on its way through the steps of `solve_batch`, each of which may replace the solution by a better one.
 
-    Nothing else refers to the solution: the graph of a run of hours takes gigabytes, and must be freed before the next one is made.
+    Nothing else refers to the solution: the graph of a run of hours takes gigabytes, and must be freed before the next
+    one is made.
 
     Attributes:
         begun: the start that the solution was grown from. solved: the solution.
@@ -171,7 +193,10 @@ class _Underway:
         return with_jumps_of(self._problem, self._configured)
 
     def raise_bias_walk(self) -> None:
-        """Solve the run anew where the biases of the IMU go farther than configured: else the track is bent, and right hypotheses seem false."""
+        """Solve the run anew where the biases of the IMU go farther than configured.
+
+        Else the track is bent, and right hypotheses seem false.
+        """
         for _ in range(_MAX_WALK_ROUNDS):
             problem, settled = self.solved
             if not problem.config.sensors[problem.imu.sensor].adapt_noise:
@@ -182,9 +207,10 @@ class _Underway:
                 return
 
     def raise_noise_of_sensors(self) -> None:
-        """Solve the run anew where sensors that scatter more than they state may have misled a start by the motion alone.
+        """Solve the run anew where sensors that scatter more than stated may have misled a start by the motion alone.
 
-        Such a start bends all states to fixes whose stated sigma is too small, and the IMU would be blamed for the misfit.
+        Such a start bends all states to fixes whose stated sigma is too small, and the IMU would be blamed for the
+        misfit.
         """
         for _ in range(MAX_SENSOR_ROUNDS):
             if not self.begun.start.by_motion or self.solved.misfit() < CONTRADICTION:
@@ -195,7 +221,7 @@ class _Underway:
                 return
 
     def take_jumps(self) -> None:
-        """Solve the run anew with the position jumps that the solution shows, as long as that is clearly more probable."""
+        """Solve the run anew with the position jumps that its solution shows, as long as that is clearly likelier."""
         for _ in range(_MAX_JUMP_ROUNDS):
             jumping = with_jumps_off_track(self._problem, self.solved.settled.verdicts)
             if jumping is None:
@@ -205,8 +231,12 @@ class _Underway:
                 return
 
     def leave_out_returns(self) -> None:
-        """Solve the run anew without the first fixes after outages, if that is clearly more probable; not where the receiver jumps."""
-        # With the noise that the sensors were found to have: else leaving fixes out would save the cost of their larger scatter.
+        """Solve the run anew without the first fixes after outages, if that is clearly more probable.
+
+        A receiver that jumps keeps all its fixes.
+        """
+        # With the noise that the sensors were found to have: else leaving fixes out would save the cost of their
+        # scatter.
         whole, misfit = replace(self.solved.problem, usual_motion=None), self.solved.misfit()
         doubted = doubtful_returns(whole, self.solved.choice(), misfit)
         if doubted is None:
@@ -224,11 +254,14 @@ class _Underway:
             self._solve_first(before)
 
     def _cost(self, problem: Problem) -> float:
-        """Return the cost (nats) of the solution by a problem with its measurements."""
+        """Return the cost (nats) of the solution in a problem that has its states."""
         return cost_of_run(problem, self.solved.settled.values, self.begun.prior)
 
     def _solved_anew(self, other: Problem, lowest: float = np.inf) -> bool:
-        """Solve another problem from its start; return whether that succeeded and cost less than `lowest` (nats). If not, the solution stays."""
+        """Solve another problem from its start; return whether that succeeded and cost less than `lowest` (nats).
+
+        If not, the solution stays.
+        """
         problem, begun, before = self._problem, self.begun, self.solved.choice()
         del self.solved  # and its graph, before the next one is made
         try:
@@ -253,11 +286,13 @@ class _Underway:
         self._hold(self.begun._replace(prior=prior), SolvedRun(problem, settled), mount)
 
     def raise_imu_noise(self) -> Problem | None:
-        """Raise the noise of the IMU where the run needs it, round by round; if that explains little, it stays as configured.
+        """Raise the noise of the IMU where the run needs it, round by round.
+
+        If that explains little, the noise stays as configured.
 
         Returns:
-            A problem with more noise, to be solved from its start, where the motion alone tells the heading: the smaller noise may have
-            excluded headings wrongly. Else None.
+            A problem with more noise, to be solved from its start, where the motion alone tells the heading: the
+                smaller noise may have excluded headings wrongly. Else None.
         """
         as_stated, misfit = self.solved.choice(), self.solved.misfit()
         left = misfit
@@ -277,11 +312,13 @@ class _Underway:
         return None
 
     def _with_noisier_imu(self, *, contradicted: bool) -> Problem | None:
-        """Return the problem with more noise of the IMU; None where it needs none, or is not to be adapted (`adapt_noise`).
+        """Return the problem with more noise of the IMU, or None.
+
+        None where it needs none, or where it is not to be adapted (`adapt_noise`).
 
         Args:
-            contradicted: whether the IMU contradicts the other sensors: all its noise is then scaled by their misfit. If not, the
-                gyroscopes' and the accelerometers' are raised to what their residuals need.
+            contradicted: whether the IMU contradicts the other sensors: all its noise is then scaled by their misfit.
+                If not, the gyroscopes' and the accelerometers' are raised to what their residuals need.
         """
         problem, settled = self.solved
         if not problem.config.sensors[problem.imu.sensor].adapt_noise:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The most probable chain of right measurements of a sensor, however far from the estimate.
 
-An estimate in the wrong place still has the right shape, so the residuals of the right measurements share one slowly changing
-offset. Where the estimate is a prediction so loose that two measurements that contradict each other both fit, the chain decides
-between them.
+An estimate in the wrong place still has the right shape, so the residuals of the right measurements share one slowly
+changing offset. Where the estimate is a prediction so loose that two measurements that contradict each other both fit,
+the chain decides between them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from graphloc.solve.hypotheses import log_false_again
 from graphloc.solve.prediction import Prediction, carried, kept_of, moved, taken_of, walk_of
 from graphloc.time import stamps_of
 
-_LOOK_BACK = 64  # candidates for the right one before
+_LOOK_BACK = 64  # measurements before one, among which the right one before it is looked for
 
 
 def best_chain(
@@ -30,14 +30,15 @@ def best_chain(
     residuals: Sequence[tuple[Residual, ...]],
     predictions: Sequence[Prediction] | None = None,
 ) -> list[int | None]:
-    """Return which mode of each of N measurements of a stream is right on the most probable chain; None: none is.
+    """Return which mode of each of N measurements is right on the most probable chain; None: the measurement is false.
 
-    It is a longest path: nodes are modes taken for right; the gain of an edge is the log likelihood ratio (right over false) of
-    its end, predicted from its beginning, as far as it is news beside the measurement before. False measurements in between that
-    repeat each other add to the gain.
+    The chain is a longest path, whose nodes are modes taken for right. An edge gains the log likelihood ratio (right
+    over false) of the node at its end, predicted from the node at its begin, times the share that is news beside the
+    measurement before. False measurements in between that repeat each other add to the gain.
 
     Args:
-        predictions: N, which limit where a chain may begin; None: anywhere.
+        indices: N of the measurements of a stream. residuals: N tuples, one residual for each mode.
+        predictions: N, which limit where a chain may begin; None: it may begin anywhere.
     """
     taken, models = taken_of(stream, indices)
     dof, count = len(residuals[0][0].raw), len(residuals)
@@ -75,8 +76,9 @@ class _Nodes(NamedTuple):
 
     Attributes:
         at: (K,) number of its measurement. mode: (K,) which of its modes.
-        raw: (K, k). cov: (K, k, k). alone: (K,) log of its prior over the density of a false measurement by itself.
-        roots: (K, k, m). lasts_s: (K,) of its prediction; None: nothing is predicted.
+        raw: (K, k) residual. cov: (K, k, k) of the measurement.
+        alone: (K,) log of its prior over the density of a false measurement by itself.
+        roots: (K, k, m), lasts_s: (K,) of its prediction (see `Prediction`); None: nothing is predicted.
     """
 
     at: NDArray[np.int64]
@@ -106,7 +108,11 @@ def _nodes(
 
 
 def _begun(nodes: _Nodes, k: int, model: FalseModel, gained: float) -> float:
-    """Return the log likelihood ratio of a chain that begins at node k; `gained`: by false ones before it."""
+    """Return the log likelihood ratio of a chain that begins at node k.
+
+    Args:
+        gained: by false measurements before it.
+    """
     raw, cov = nodes.raw[k], nodes.cov[k]
     if nodes.roots is None:
         nis, begun = float(len(raw)), cov + model.cov
@@ -120,7 +126,7 @@ def _followed(nodes: _Nodes, k: int, back: slice, ages_s: Array, news: float, wa
     """Return the log likelihood ratio (J,) that node k adds to chains that end at each of J nodes before it.
 
     Args:
-        back: these nodes. ages_s: (J,) time since each. news: of the measurement. walk: (k, k), see `walk_of`.
+        back: the J nodes. ages_s: (J,) time since each. news: of the measurement. walk: (k, k), see `walk_of`.
     """
     raw, cov = nodes.raw[k], nodes.cov[k]
     expected, left = nodes.raw[back], nodes.cov[back]
@@ -133,7 +139,11 @@ def _followed(nodes: _Nodes, k: int, back: slice, ages_s: Array, news: float, wa
 
 
 def _backwards(k: int, before: NDArray[np.int64]) -> Iterator[int]:
-    """Yield the nodes of a path from its last, k, to its first; `before`: the node before each, -1 of the first."""
+    """Yield the nodes of a path from its last, k, to its first.
+
+    Args:
+        before: (K,) the node before each on its best path; -1: it is the first.
+    """
     while k >= 0:
         yield k
         k = int(before[k])
@@ -147,7 +157,9 @@ def _gained_by_repeats(
     stamps_s: Array,
     walk: Array,
 ) -> Array:
-    """Return the log likelihood (N + 1,) gained by false measurements that repeat the one before, up to and without each.
+    """Return the log likelihood (N + 1,) gained by false measurements that repeat the one before them.
+
+    It is summed over the measurements before each, and over all N.
 
     Args:
         nothing: (N,) log of prior x density of a false one by itself. walk: (N, k, k) as of `walk_of`.

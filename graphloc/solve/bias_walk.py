@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Walk of the IMU's biases by a solved run: how many times the configured one explains how far they went.
+"""How far the IMU's biases walk by a solved run: the factor on their configured random walk that explains it.
 
-A cheap IMU that warms up wanders by a hundred times what a good one does. Held to its configured walk it bends the track, its bounds
-are too small, and it seems to contradict the other sensors.
+A cheap IMU that warms up wanders by a hundred times what a good one does. Held to its configured walk it bends the
+track, its bounds are too small, and it seems to contradict the other sensors.
 """
 
 from __future__ import annotations
@@ -26,23 +26,30 @@ from graphloc.solve.linearised import linearised, normal_solver
 from graphloc.time import NS_PER_S
 
 WANDERS_S = 60.0
-"""Time over which it is looked at how far a bias has gone."""
+"""Time, s, over which the change of a bias is looked at."""
 WALK_KEYS = ("accel_bias_instability_ug", "gyro_bias_instability_deg_per_h")
-"""What is configured of accelerometers and gyroscopes."""
-# Sigmas of its random walk over that, from which variance components are asked whether it needs more walk (`_UNLIKELY`): smoothed, a
-# bias that walks so moves by less than two. A warning alone, where the walk is not to be raised, has no such test and a higher bound.
+"""Keys that configure the walk of the biases of accelerometers and gyroscopes."""
+# Sigmas of the random walk over `WANDERS_S`, from which variance components test whether a bias needs more of it
+# (`_UNLIKELY`): one that walks as configured moves, smoothed, by less than two. A warning alone, where the walk is not
+# to be raised, has no such test, and a higher bound.
 _LOOKED_AT = 3.0
-# Probabilities: of some ten looks every ten seconds one finds it by chance about once in 150 h; and that of each part of the time.
+# Probabilities of a change below which it is too large: of the whole change (with ten looks every ten seconds, chance
+# gives one in about 150 h), and of each part of it.
 _TOO_FAR, _A_PART = 1e-6, 0.01
-_MOST_STEP, _LEAST_STEP = 10.0, 1.3  # what is known is too sure as well, so more is not believed at once
-_LEAST_SHARE = 0.1  # of the walk, that a bias may go though nothing measures it: rounding
+# Most and least factor at once: what is known is too sure as well, so more is not believed.
+_MOST_STEP, _LEAST_STEP = 10.0, 1.3
+_LEAST_SHARE = 0.1  # share of the variance of the walk that is allowed though the data deny it: rounding
 _UNLIKELY, _LEAST_TIMES = 1e-4, 2.0
 MOST_TIMES = 100.0
-"""Most that the walk is raised: online in all, offline by one round of variance components."""
+"""Largest factor on the walk: online in all, offline by one round of variance components."""
 
 
 class BiasWanders(Exception):
-    """The biases walk so many times farther than configured; `times`: by key of the IMU's configuration."""
+    """The biases walk farther than configured.
+
+    Attributes:
+        times: factors on their walk, by key of the IMU's configuration.
+    """
 
     def __init__(self, times: dict[str, float]) -> None:
         super().__init__(times)
@@ -58,7 +65,11 @@ class KnownBias(NamedTuple):
 
 
 def known_bias(problem: Problem, values: gtsam.Values, k: int, past: Past) -> KnownBias:
-    """Return the biases at state `k` by all data before it; `values`: near those that these data were linearised at."""
+    """Return the biases at state `k` by all data before it.
+
+    Args:
+        values: near those that these data were linearised at.
+    """
     own, order = keys.bias(int(problem.timeline.slow_of[k])), gtsam.Ordering()
     for key in (*(key for key in past.known if key != own), own):
         order.push_back(key)
@@ -70,7 +81,10 @@ def known_bias(problem: Problem, values: gtsam.Values, k: int, past: Past) -> Kn
 
 
 def wandered(problem: Problem, values: gtsam.Values) -> Array:
-    """Return how far accelerometers and gyroscopes have gone (2,), the worst axis of each, in sigmas of their random walk, within a minute; 0 in a shorter run."""
+    """Return how far (2,) accelerometers and gyroscopes went within a minute, in sigmas of their random walk.
+
+    Of each, it is that of the worst axis; 0 in a shorter run.
+    """
     t_s = (problem.timeline.slow_stamps_ns - problem.timeline.slow_stamps_ns[0]) / NS_PER_S
     later = np.searchsorted(t_s, t_s + WANDERS_S)
     begin = np.flatnonzero(later < len(t_s))
@@ -88,13 +102,15 @@ def wandered(problem: Problem, values: gtsam.Values) -> Array:
 def went_too_far(
     before: Sequence[KnownBias], now: KnownBias, links: InertialLink, *, lasting: bool = False
 ) -> tuple[int, float] | None:
-    """Return which biases went farther than they may have (0: of accelerometers, 1: of gyroscopes), and how many times the walk explains it; None: none did.
+    """Return which biases went too far (0: accelerometers, 1: gyroscopes) and the factor on the walk that explains it.
 
-    An estimate that is as good as it says goes, from b with covariance P to b' with P', by N(0, P + Q - P'), Q: the walk in between.
+    None: none did. An estimate that is as good as it says goes from b with covariance P to b' with P' by N(0, P + Q -
+    P'), Q: the walk in between.
 
     Args:
-        before: of the same estimate, with less data, by stamp. lasting: whether they have to go on in two parts of that time: where an
-            estimate is put right they go once.
+        before: what was known of the biases by less data, by stamp. now: what is known.
+        lasting: whether they must have gone on in two parts of that time: where an estimate is corrected, they change
+            once.
     """
 
     def likely(then: KnownBias, later: KnownBias, k: int) -> float:
@@ -107,32 +123,36 @@ def went_too_far(
     pairs = [(then, k) for then in before for k in range(2) if not lasting or lasts(then, k)]
     if not pairs:
         return None
-    # Those that wander bend the others: the least likely are they.
+    # Biases that wander bend the others, so the least likely ones are those that wander.
     then, k = min(pairs, key=lambda pair: likely(pair[0], now, pair[1]))
     times = _needed(_gone(then, now, links, k))
     return (k, times) if likely(then, now, k) < _TOO_FAR and times > _LEAST_STEP else None
 
 
 def _gone(then: KnownBias, now: KnownBias, links: InertialLink, k: int) -> Array:
-    """Return (3, 3), of each axis of accelerometers or gyroscopes the square of how far it went, P - P' and Q."""
+    """Return (3, 3): squared change, P - P' and Q (see `went_too_far`) of each axis of one kind, `k`, of sensor."""
     walk = links.bias_steps(then.stamp_ns, now.stamp_ns) ** 2
     each = np.array([(now.bias - then.bias) ** 2, then.variance - now.variance, walk])
     return each[:, 3 * k : 3 * k + 3]
 
 
 def _squares(gone: Array, times: float) -> float:
-    """Return the sum of the squares by which three biases went, by their variance with so many times the walk; `gone`: as `_gone` gives it."""
+    """Return the sum of the squared changes of three biases over their variances, with their walk `times` as large.
+
+    Args:
+        gone: as of `_gone`.
+    """
     squares, known, walk = gone
     return float((squares / np.maximum(known + times**2 * walk, _LEAST_SHARE * walk)).sum())
 
 
 def _likely(gone: Array) -> float:
-    """Return how likely it is that they went as far as they did, or farther; `gone`: likewise."""
+    """Return the probability that three biases change as far as they did, or farther; `gone`: as of `_gone`."""
     return float(chdtrc(gone.shape[1], _squares(gone, 1.0)))
 
 
 def _needed(gone: Array) -> float:
-    """Return how many times the walk explains it, at most `_MOST_STEP`; `gone`: likewise."""
+    """Return the factor on the walk that explains the change, at most `_MOST_STEP`; `gone`: as of `_gone`."""
 
     def beyond(times: float) -> float:
         return _squares(gone, times) - float(gone.shape[1])
@@ -146,7 +166,10 @@ def _needed(gone: Array) -> float:
 
 
 def with_needed_walk(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Problem | None:
-    """Return the problem with as much walk of the biases as the run needs, where that is clearly more than it has; else None."""
+    """Return the problem with as much walk of the biases as the run needs, if that is clearly more than it has.
+
+    Else None.
+    """
     high = wandered(problem, values) > _LOOKED_AT
     if not high.any():
         return None
@@ -166,13 +189,16 @@ def with_needed_walk(problem: Problem, values: gtsam.Values, verdicts: Verdicts,
 
 
 def walk_times(stated: Any, taken: Any) -> dict[str, float]:
-    """Return by what factors the walk of the biases is larger in one configuration of an IMU than in another, by key; without those of 1."""
+    """Return, by key, the factors by which the biases of an IMU walk farther in one configuration than in another.
+
+    Factors of 1 are left out.
+    """
     every = {key: getattr(taken, key) / getattr(stated, key) for key in WALK_KEYS}
     return {key: times for key, times in every.items() if times > 1.0}
 
 
 def too_steady(name: str, stated: Any, taken: Any) -> str:
-    """Return a line on an IMU whose biases walk farther than configured, and what is taken instead; empty where they do not.
+    """Return a warning on an IMU whose biases walk farther than configured, and on what is taken; empty if they do not.
 
     Args:
         stated, taken: its configuration, and that with the walk that is taken.

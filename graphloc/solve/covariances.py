@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariances in the axes of world, and what a position is off by beyond them."""
+"""Covariances in the axes of world, and errors of a position that they do not contain."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ ANY_HEADING_RAD = float(np.pi / np.sqrt(3.0))
 
 
 def world_covariance(cov_body: Any, R: Array, lever_m: Array) -> Array:
-    """Turn a body-tangent covariance (rotation first) into x, y, z, rotation, all about the world's axes.
+    """Return a body-tangent covariance (rotation first) as that of x, y, z, rotation, all about the world's axes.
 
-    For the point `lever_m` (body axes) from the state. Only the blocks are rotated: the full adjoint
-    would mix yaw times distance from the datum into position.
+    It is for the point `lever_m` (body axes) from the state. Only the blocks are rotated: the full adjoint would mix
+    yaw times distance from the datum into position.
     """
     turn = to_world(R, lever_m)
     return np.asarray(turn @ np.asarray(cov_body) @ turn.T)
@@ -35,9 +35,9 @@ def to_world(R: Array, lever_m: Array) -> Array:
 
 
 def limit_heading(cov: Array) -> None:
-    """Scale the heading in covariances (..., 6, 6), in axes of world, to at most that of one that may be any.
+    """Scale the heading in covariances (..., 6, 6), in axes of world, to at most that of an unknown heading.
 
-    Linearised, what is hardly known is stated as many turns.
+    Linearised, a heading that is hardly known is stated as uncertain by many turns.
     """
     share = np.minimum(1.0, ANY_HEADING_RAD / np.sqrt(cov[..., 5, 5]))[..., None]
     cov[..., 5, :] *= share
@@ -45,10 +45,14 @@ def limit_heading(cov: Array) -> None:
 
 
 def widen_heading(cov: Array, heading_var: Array | float) -> None:
-    """Raise the variance of the heading in covariances (..., 6, 6), in axes of world, to at least `heading_var` (...), rad^2.
+    """Raise the variance of the heading in covariances (..., 6, 6), in axes of world, to at least `heading_var`, rad^2.
 
-    What measures position (an antenna) stays where it is, and the body turns about it. The arm between them is what the covariance
-    says of position and heading together; turned by tens of degrees, the body moves along it as well as across.
+    What measures position (an antenna) stays where it is, and the body turns about it. The arm between the two follows
+    from the covariance of position and heading. Turned by tens of degrees, the body moves along the arm as well as
+    across.
+
+    Args:
+        heading_var: (...), rad^2.
     """
     more = np.maximum(heading_var - cov[..., 5, 5], 0.0)
     across = cov[..., :2, 5] / cov[..., 5, 5, None]  # d position / d heading, m
@@ -60,9 +64,9 @@ def widen_heading(cov: Array, heading_var: Array | float) -> None:
 
 
 def untold_errors(streams: Sequence[Any]) -> dict[str, SlowProcess]:
-    """Return the slow errors (east, north, up) that nothing can tell from motion, by sensor.
+    """Return, by sensor, the slow errors (east, north, up) that nothing can tell from motion.
 
-    Without that of heights which are not used (`Stream.without_height`).
+    Up is 0 for a sensor whose heights are not used (`Stream.without_height`).
     """
     return {
         s.name: replace(s.left_out, sigma=s.left_out.sigma * [1.0, 1.0, not s.without_height])
@@ -72,5 +76,5 @@ def untold_errors(streams: Sequence[Any]) -> dict[str, SlowProcess]:
 
 
 def unmodelled_covariance(streams: Sequence[Any]) -> Array:
-    """Return the covariance (3, 3) of slow errors that nothing can tell from motion: the position is off by as much."""
+    """Return the covariance (3, 3) of the position from slow errors that nothing can tell from motion."""
     return sum((np.diag(slow.sigma**2) for slow in untold_errors(streams).values()), np.zeros((3, 3)))

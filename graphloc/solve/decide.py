@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decisions on each measurement, given an estimate: mode, weight, kernel.
 
-Sensors without hypotheses keep their kernel. Sensors with hypotheses are weighed as a mixture: each mode has a density, and so
-has 'false'. The weight is the posterior probability that the chosen mode is right. Where the estimate is a prediction (without
-the measurement), its covariance is added to the measurement's, so that a state that has drifted through an outage does not
-reject the right measurements.
+Sensors without hypotheses keep their kernel. Sensors with hypotheses are weighed as a mixture: each mode has a density,
+and so has 'false'. The weight is the posterior probability that the chosen mode is right. Where the estimate is a
+prediction (without the measurement), its covariance is added to the measurement's, so that a state that has drifted
+through an outage does not reject the right measurements.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ _GENTLEST = {
     Stage.FINAL: None,
 }
 _CONVEXITY = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
-_WIDEST = 1e9  # sigmas: larger residuals (0.1 mm stated, 100 km off) count the same
+_WIDEST = 1e9  # sigmas of the widest kernel: 100 km off where 0.1 mm is stated
 CREDIBLE = 6.0  # sigmas of a slow error: a sensor that agrees only by a larger one does not really agree
 AGREES = 0.5  # a weight from which a measurement counts as used, and its sensor as agreeing
 NEGLIGIBLE = 1e-3  # a weight below this leaves the measurement out of the graph
 
-# Of a state and a key: the covariance of the key's value as it is predicted for that state; None: not predicted.
+# (state, key) -> covariance of the key's value as predicted for that state; None: it is not predicted.
 PredictedCovariance = Callable[[int, int], Array | None]
 
 
@@ -58,7 +58,7 @@ class Verdict:
     """A decision, and what it was based on.
 
     Attributes:
-        decision: None leaves the measurement out. mode: the chosen one, also then.
+        decision: None leaves the measurement out. mode: the chosen one, even if the measurement is left out.
         weight: posterior probability that the mode is right (or the kernel's weight).
         mode_probability: of the chosen mode among the modes.
         residual: of the chosen mode, at the attachment `at`.
@@ -77,18 +77,18 @@ class Verdict:
 
     @classmethod
     def false(cls, residual: Residual, at: Attachment, reason: str = "") -> Verdict:
-        """Return the verdict that a measurement is false, or not judged yet: it is left out."""
+        """Return the verdict that leaves a measurement out, as false or as not judged yet."""
         return cls(None, 0.0, 1.0, residual, 0, at, reason=reason)
 
     @property
     def expected_cost(self) -> float:
-        """Expectation of its weighted square."""
+        """Expectation of the weighted squared residual."""
         expected = self.residual.expected_nis
         return (len(self.residual.raw) if expected is None else expected) * self.weight
 
 
 def far_sigmas(slow: SlowProcess | None, at: Attachment) -> float:
-    """Return how many sigmas the part of a sensor's slow error is that may jump; 0 where it has none."""
+    """Return the size, in sigmas, of a sensor's slow error on the axes that may stay far off; 0 where it has none."""
     if slow is None or at.slow_value is None:
         return 0.0
     return float(np.linalg.norm(at.slow_value[slow.far_axes] / slow.sigma[slow.far_axes]))
@@ -101,7 +101,11 @@ Verdicts = dict[tuple[int, int], Verdict]
 def predicted(
     found: tuple[Residual, ...], at: Attachment, k: int, covariance: PredictedCovariance
 ) -> Prediction | None:
-    """Return the prediction of a residual; None where the estimate already contains the measurement."""
+    """Return the prediction of a measurement's residual; None where the estimate already contains the measurement.
+
+    Args:
+        found: its residuals, one for each mode. at: its attachment, to state `k`.
+    """
     P = covariance(k, at.pose_key)
     if P is None or (V := covariance(k, keys.velocity(k))) is None:
         return None
@@ -127,8 +131,8 @@ def weigh(
         first: first state. last: last state, inclusive.
         stage: how far off the estimate may be.
         covariance: (state, key) -> covariance of the key's prediction (a pose's in the body tangent), or None.
-        hypotheses: weigh sensors that can be false by their hypotheses; else by the stage's kernel, on the
-            nearest mode.
+        hypotheses: whether sensors that can be false are weighed by their hypotheses; else by the stage's kernel, on
+            the nearest mode.
         only: decide on these alone, all of sensors with hypotheses.
     """
     verdicts: Verdicts = {}
@@ -153,7 +157,7 @@ def weigh(
 
 
 def residuals_at(problem: Sited, stream: Judged, i: int, values: Estimates) -> tuple[Attachment, tuple[Residual, ...]]:
-    """Return the attachment of a measurement at the present estimate, and its residuals there, one per mode."""
+    """Return the attachment of a measurement at the present estimate, and its residuals there, one for each mode."""
     at = attach(problem, stream, i, values)
     return at, stream.row.residuals(stream.measurements[i], stream.config, at)
 
@@ -161,7 +165,7 @@ def residuals_at(problem: Sited, stream: Judged, i: int, values: Estimates) -> t
 def _by_kernel(
     stream: Stream, indices: list[int], attached: list[Attachment], residuals: list[tuple[Residual, ...]], stage: Stage
 ) -> list[Verdict]:
-    """The sensor's own kernel, or the stage's where that one is gentler."""
+    """Return the verdicts by the sensor's own kernel, or by the stage's where that is gentler."""
     nis = _nis([r for found in residuals for r in found])
     starts = np.cumsum([0, *(len(found) for found in residuals)])
     mode = [int(np.argmin(nis[a:b])) for a, b in pairwise(starts)]
@@ -171,14 +175,15 @@ def _by_kernel(
     # The norm of k whitened residuals is about sqrt(k): the threshold is larger by that.
     dof = len(residuals[0][0].raw)
     times, white = scatter_of(best, dof), 1.0
-    if times > 1.0 and not stream.row.absolute:  # of positions, a shared error may be that of the estimate
+    if times > 1.0 and not stream.row.absolute:  # an error that positions share may be the estimate's
         stamps_ns = np.array([stream.measurements[i].stamp_ns for i in indices])
         normal = np.array([found[m].normalised() for m, found in zip(mode, residuals, strict=True)])
         times = min(times, scatter_of_pairs(stamps_ns, normal))
         white = min(times, white_scatter(stamps_ns, normal))
-    # Around an estimate that is metres off, right matches are many sigmas away. At full weight they, and false ones, bend the motion
-    # until the solver diverges; at the weight of what they are off by, the rest holds it together. Not so of fixes, which lead
-    # back; nor of what shares an error (a mount), which has to give way.
+    # Around an estimate that is metres off, right matches are many sigmas away. At full weight, right and false ones
+    # bend the motion until the solver diverges; weighted by how far they are off, the other sensors hold it together.
+    # Fixes keep their weight, as they lead back; and so do measurements that share an error (a mount), which has to
+    # give way.
     by_scatter = stage is Stage.FAR and stream.row.false is not None and not stream.constants
     noisier = times if by_scatter else noisier_than_stated(white)
     scale = min(own.scale * times / noisier * float(np.sqrt(dof)), _WIDEST)
@@ -191,7 +196,7 @@ def _by_kernel(
 
 
 def _nis(residuals: list[Residual]) -> Array:
-    """Squared normalised residuals, in one call where they have the same shape."""
+    """Return the squared normalised residuals, in one call where they have the same shape."""
     if len({len(r.raw) for r in residuals}) > 1:
         return np.array([r.nis() for r in residuals])
     raw = np.array([r.raw for r in residuals])
@@ -199,7 +204,10 @@ def _nis(residuals: list[Residual]) -> Array:
 
 
 def cost_of_noise(verdicts: Verdicts) -> float:
-    """Return what larger noise than stated costs, -log of its density: without it, noise would explain any heading."""
+    """Return the cost of taking noise as larger than stated, -log of its density.
+
+    Without this cost, noise would explain any heading.
+    """
     found = [(v.decision.weight, len(v.residual.raw)) for v in verdicts.values() if v.decision and v.decision.kernel]
     return float(sum(-0.5 * dof * np.log(weight) for weight, dof in found))
 
@@ -213,8 +221,9 @@ def by_hypotheses(
 ) -> list[Verdict]:
     """Judge measurements of a sensor with hypotheses as a sequence (see `sequence_of`).
 
-    Two measurements that contradict each other, both in the graph, pull a loose prediction to where neither is right. So of those
-    judged by a prediction, only the most probable chain of measurements that agree is believed.
+    Two measurements that contradict each other, both in the graph, pull a loose prediction to where neither is right.
+    So of the measurements that are judged by a prediction, only the most probable chain of those that agree is
+    believed.
     """
     new = {n: prediction for n, prediction in enumerate(predictions) if prediction is not None}
     chain: list[int | None] = [None] * len(residuals)
@@ -237,7 +246,10 @@ def by_hypotheses(
 
 
 def agrees(stream: Stream, residual: Residual) -> bool:
-    """Whether a residual agrees by the loss of its sensor, as wide as configured; of a sensor with hypotheses, whether 95 % are smaller."""
+    """Return whether a residual agrees by the loss of its sensor, as wide as configured.
+
+    For a sensor with hypotheses: whether it is within the 95 % quantile of chi-square.
+    """
     nis, dof = residual.nis(), len(residual.raw)
     if stream.row.false is not None:
         return nis < chi2_95(dof)
@@ -253,7 +265,10 @@ def met(
 
 
 def log_evidence(problem: Problem, values: gtsam.Values, first: int, last: int) -> float:
-    """Return the log probability of states first..last around an estimate, marginalised over all hypotheses."""
+    """Return the log probability of the measurements of states first..last around an estimate.
+
+    Those of sensors with hypotheses count, marginalised over all hypotheses.
+    """
     total = 0.0
     for stream in problem.streams:
         if stream.row.false is not None:
@@ -287,7 +302,7 @@ def believing(
 
 
 def decisions(verdicts: Verdicts, without: Container[tuple[int, int]] = ()) -> Decisions:
-    """Return the decisions of verdicts for the graph builder, without those of `without`."""
+    """Return the decisions of verdicts for the graph builder, but for the measurements in `without`."""
     return {
         key: None if v.decision is None or key in without else Decided(v.decision, v.at, v.residual)
         for key, v in verdicts.items()
@@ -305,5 +320,5 @@ def decisions_on(few: Thinned, verdicts: Verdicts, values: gtsam.Values) -> Deci
 
 
 def predicted_by(cov: Mapping[int, Array]) -> PredictedCovariance:
-    """Return (state, key) -> covariance of the key's value, of those of a run without the measurements."""
+    """Return a `PredictedCovariance` by the covariances of a run without the measurements that are judged."""
     return lambda _state, key: cov[key]

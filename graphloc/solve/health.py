@@ -27,28 +27,28 @@ _LOST_HEADING_DEG = 45.0  # 95 % bound beyond which a heading helps nobody
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
 
 FAR_OFF = 3.0
-"""Sigmas of its setting from which an estimate is said to be far from it."""
+"""Sigmas from its setting beyond which an estimate is said to be far off."""
 
 
 def late_of(stream: Stream, values: gtsam.Values) -> float | None:
-    """Return how much later than stamped a sensor measures, s, where its slow state tells it."""
+    """Return how much later than stamped a sensor measures, s; None where its slow state does not estimate that."""
     if stream.slow is None or (axis := stream.slow.late) is None:
         return None
     return float(values.atVector(keys.slow(stream.number, 0))[axis])
 
 
 def why_late(sensor: str) -> str:
-    """Return why no pose beside a sensor whose stamps are far off is called good."""
+    """Return the reason why no pose is good beside a sensor whose stamps are far off."""
     return f"the stamps of {sensor} are far off what stamp_sigma_s allows for"
 
 
 def why_unlikely(sensor: str) -> str:
-    """Return why no pose is called good beside a sensor that agrees only by a slow error which is unlikely to be so large."""
+    """Return the reason why no pose is good beside a sensor that agrees only by an unlikely large slow error."""
     return f"{sensor} agrees only by more than {FAR_OFF:g} sigmas of its slow error: it contradicts the others"
 
 
 def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[str]:
-    """Why each state cannot be called good; empty where nothing speaks against it."""
+    """Return, by state, the reason why it cannot be called good; empty where there is none."""
     if throughout := _misfit_of_run(problem, result, stats):
         return [throughout] * len(problem.timeline.stamps_ns)
     said = _beside_jumps(problem)
@@ -63,7 +63,7 @@ def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[st
 
 
 def _misfit_of_run(problem: Problem, result: BatchResult, stats: SolveStats) -> str:
-    """Return why no state of the run can be called good; empty where nothing says so."""
+    """Return the reason why no state of the run can be called good; empty if there is none."""
     if not result.converged:
         return "the solver did not converge"
     if result.noise_scale > LARGEST_NOISE_SCALE or stats.cost > CONTRADICTING_COST * max(stats.expected_cost, 1.0):
@@ -78,7 +78,7 @@ def _misfit_of_run(problem: Problem, result: BatchResult, stats: SolveStats) -> 
 
 
 def _beside_jumps(problem: Problem) -> list[str]:
-    """Return why each state is in doubt near a jump of the fixes, whose bounds allow for no slow error; else ''."""
+    """Return, by state, the reason for doubt near a jump of fixes whose bounds allow for no slow error; else ''."""
     stamps_ns = problem.timeline.stamps_ns
     said = [""] * len(stamps_ns)
     for stream in problem.streams:
@@ -90,12 +90,12 @@ def _beside_jumps(problem: Problem) -> list[str]:
 
 
 def _unlikely(problem: Problem, by_turns: Sequence[Stream], verdicts: dict[tuple[int, int], Verdict]) -> Sequence[str]:
-    """Return the sensor whose newest measurement that agrees does so only by a slow error which is unlikely so large, at each state.
+    """Return, by state, the sensor whose newest agreeing measurement agrees only by an unlikely large slow error.
 
-    Before the first one, it is the one to come: a smoother knows it. Empty where there is none.
+    Before the first agreeing measurement, it is that one: a smoother knows what comes. Empty where there is none.
 
     Args:
-        by_turns: those that read one receiver, or a single one.
+        by_turns: the sensors that read one receiver by turns, or a single sensor.
     """
     agrees = sorted(
         (m.stamp_ns, stream.name if far_sigmas(stream.slow, verdict.at) > FAR_OFF else "")
@@ -111,7 +111,7 @@ def _unlikely(problem: Problem, by_turns: Sequence[Stream], verdicts: dict[tuple
 
 
 def since_agreed(problem: Problem, stream: Stream, verdicts: dict[tuple[int, int], Verdict]) -> Array:
-    """Return (N,) by state how long a sensor has not agreed, s; inf before it first did."""
+    """Return (N,), by state, how long ago a sensor last agreed, s; inf before it first did."""
     agreed = np.array(
         [
             m.stamp_ns
@@ -129,7 +129,13 @@ def since_agreed(problem: Problem, stream: Stream, verdicts: dict[tuple[int, int
 
 
 def of_receivers(since: Mapping[str, Any], config: VesselConfig) -> dict[str, Any]:
-    """Return how long each absolute sensor has not agreed, s, by sensor, numbers or arrays: as one those that read one receiver by turns."""
+    """Return, by absolute sensor, how long its receiver has not agreed, s, numbers or arrays.
+
+    Sensors that read one receiver by turns count as one.
+
+    Args:
+        since: by sensor, how long it has not agreed, s.
+    """
     alike = {name: config.by_turns(name) for name in since}
     return {
         name: reduce(np.minimum, (since[other] for other in others if other in since)) for name, others in alike.items()
@@ -137,7 +143,7 @@ def of_receivers(since: Mapping[str, Any], config: VesselConfig) -> dict[str, An
 
 
 def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:
-    """Seconds since a sensor agreed, or until it first does: a smoother knows what comes."""
+    """Return the seconds since a sensor agreed, or, before that, until it first does: a smoother knows what comes."""
     known = np.flatnonzero(np.isfinite(since))
     if not len(known):
         return since
@@ -148,7 +154,7 @@ def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:
 def health_over_time(
     trajectory: Trajectory, since: dict[str, Array], misfits: Sequence[str], good_bound_m: float
 ) -> tuple[tuple[Health, ...], tuple[HealthReason, ...]]:
-    """Return the health of each pose of a track that is solved, and why it is not good: as `health_of`, which knows what comes.
+    """Return the health of each pose of a solved track, and why it is not good: by `health_of`, knowing what comes.
 
     Args:
         since: by absolute sensor (N,), s since it last agreed. misfits: by state, what else speaks against it.
@@ -168,8 +174,8 @@ def health_of(
     """Return how far a pose can be trusted, and why not fully.
 
     Args:
-        cov: (6, 6) as in `Trajectory`. away_s: s to where each absolute sensor agrees. good_bound_m: `output.good_bound_m`.
-        misfit: what else speaks against it.
+        cov: (6, 6) as in `Trajectory`. away_s: s to where each absolute sensor agrees.
+        good_bound_m: `output.good_bound_m`. misfit: what else speaks against the pose.
     """
     bound_m, _, heading_deg = (float(v) for v in bounds_95(cov[None])[0])
     silent = [name for name, s in away_s.items() if s > _SILENT_S]

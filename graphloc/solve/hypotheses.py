@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Right or false: the measurements of one sensor with hypotheses, as a hidden Markov chain.
 
-The error of a false measurement is drawn independently, or repeats that of the false one before it. So right and false form a
-chain with two states, and forward-backward gives the posteriors. Without the repeats, six scans that take the same wrong boat
-for the right one would outweigh IMU and GNSS together. For measurements judged by a prediction each state is split in two,
-before and after the first right one: only then is the prediction conditioned on it (`predict_residuals`).
+The error of a false measurement is drawn independently, or repeats that of the false one before it. So right and false
+form a chain with two states, and forward-backward gives the posteriors. Without the repeats, six scans that take the
+same wrong boat for the right one would outweigh IMU and GNSS together. If measurements are judged by a prediction, each
+state is split in two, before and after the first right one: only after it is the prediction conditioned on it
+(`predict_residuals`).
 
 This is local, around an estimate; `best_chain` is global.
 """
@@ -26,12 +27,15 @@ from graphloc.solve.prediction import PredictedResidual, Prediction, moved, take
 
 @dataclass(frozen=True, slots=True)
 class FalseSequence:
-    """Log of prior x density of N measurements in order; [0]: before, [1]: after a new one among them was right.
+    """Logs of prior x density of N measurements in order.
+
+    Of each (2, N), [0] holds before and [1] after the first right one of those that are judged by a prediction.
 
     Attributes:
-        right: (2, N) of any mode being right. fresh, repeated: (2, N) of all being false, after a right one and
-            after a false one. new: (N,) whether one is judged by a prediction. news: (N,) share of the evidence of each
-            that is independent of the one before it.
+        right: (2, N) that any mode is right.
+        fresh, repeated: (2, N) that all modes are false, after a right measurement and after a false one.
+        new: (N,) whether a measurement is judged by a prediction.
+        news: (N,) share of the evidence of each that is independent of the one before it.
     """
 
     right: Array
@@ -41,7 +45,7 @@ class FalseSequence:
     news: Array
 
     def posterior(self) -> Array:
-        """Return the probability (N,) that a mode is right."""
+        """Return the probability (N,) that a mode of each measurement is right."""
         ahead = self._ahead()
         back = np.zeros_like(ahead)
         for n in range(len(back) - 2, -1, -1):
@@ -55,12 +59,12 @@ class FalseSequence:
         return np.asarray(np.exp(both[:, 0] - np.logaddexp(both[:, 0], both[:, 1])))
 
     def log_evidence(self) -> float:
-        """Return the log probability of the whole sequence, of each measurement as far as it is news."""
+        """Return the log probability of the whole sequence, each measurement counted by its share of news."""
         so_far = np.logaddexp.reduce(self._ahead(), axis=(1, 2))
         return float(self.news @ np.diff(so_far, prepend=0.0))
 
     def _ahead(self) -> Array:
-        """(N, right or false, before or after)."""
+        """Return the log probabilities of the forward pass (N, right or false, before or after)."""
         ahead = np.full((len(self.new), 2, 2), -np.inf)
         r, f = np.array([0.0, -np.inf]), np.full(2, -np.inf)
         for n, new in enumerate(self.new):
@@ -83,7 +87,8 @@ def sequence_of(
     Args:
         stream: the sensor; its row has a false model. indices: N of its measurements.
         residuals: N tuples, one residual for each mode.
-        predictions: N, or None where it took part in the estimate. conditioned: the residuals, predicted given a chain.
+        predictions: N; None for a measurement that took part in the estimate.
+        conditioned: the residuals, predicted given a chain.
     """
     taken, models = taken_of(stream, indices)
     densities = np.zeros((2, 2, len(models)))  # right or false, before or after
@@ -112,7 +117,11 @@ def log_evidence_of(stream: Judged, indices: Sequence[int], residuals: Sequence[
 
 
 def log_right_and_false(modes: tuple[Residual, ...], P: Array | None, model: FalseModel) -> tuple[float, float]:
-    """Return the log of prior x density: that any mode is right, and that all are false; both widened by the prediction's covariance."""
+    """Return the logs of prior x density that any mode is right, and that all are false.
+
+    Args:
+        P: (k, k) covariance of the prediction, by which both densities are widened; None: there is none.
+    """
     right = np.logaddexp.reduce([r.log_density(P) for r in modes])
     around = model.cov if P is None else model.cov + P
     share = np.log([r.prior for r in modes]) - np.log(sum(r.prior for r in modes))
@@ -123,7 +132,11 @@ def log_right_and_false(modes: tuple[Residual, ...], P: Array | None, model: Fal
 def log_false_again(
     model: FalseModel, before: tuple[Residual, ...], now: tuple[Residual, ...], walked: Array | float
 ) -> float:
-    """Return the log of prior x density that a measurement is false by the error of the one before it; `walked` as in `_log_repeat`."""
+    """Return the log of prior x density that a measurement is false by the error of the one before it.
+
+    Args:
+        walked: as of `_log_repeat`.
+    """
     return float(np.log(max(model.repeats * model.probability, 1e-12))) + _log_repeat(before, now, walked)
 
 

@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far the IMU's axes are from where its mount says, by what a solved run's other sensors say of the body.
 
-With the mount turned by a small rotation m, body axes, the IMU measures what it would if the body were turned as much, while all
-other sensors stay: its rows of the linearised run J dx = b, and that of its levelling at the start, become J dx + c m = b, with
+With the mount turned by a small rotation m, body axes, the IMU measures what it would if the body were turned as much,
+while all other sensors stay: its rows of the linearised run J dx = b, and that of its levelling at the start, become J
+dx + c m = b, with
 
     c = J_imu U,   U: m in the attitude of every state
 
 What no change of the states explains, c~ = c - J argmin |J X - c|, carries the information on m:
 
-    (c~'c~ + 1 / s^2) m = c~'b - t / s^2,   s: of the mount, t: by which it is turned already
+    (c~'c~ + 1 / s^2) m = c~'b - t / s^2,   s: sigma of the mount, t: by which it is turned already
 
-and the states follow by X m: what is not known of m widens their covariance (a consider parameter, Schmidt 1966). Without it, fixes
-of centimetres tell the heading of an IMU to some tenths of a degree, and state that of the vessel to as much.
+and the states follow by X m. So what is not known of m widens their covariance (a consider parameter, Schmidt 1966).
+Without that, fixes of centimetres tell the heading of an IMU to some tenths of a degree, and the heading of the vessel
+is stated as well.
 
-Of m only the yaw is taken from the run. Roll and pitch show in how an antenna swings about the IMU, as its lever arm does, in
-which decimetres are usual: a height that is 0.4 m wrong became a mount that is tilted by 4 deg, and a place 0.15 m off.
+Of m only the yaw is taken from the run. Roll and pitch show in how an antenna swings about the IMU, but so does its
+lever arm, in which decimetres are usual: a height that is 0.4 m wrong became a mount that is tilted by 4 deg, and a
+place 0.15 m off.
 """
 
 from __future__ import annotations
@@ -33,18 +36,21 @@ from graphloc.solve._passes import Settled, cost_of_run, settle
 from graphloc.solve.decide import Stage, Verdicts, weigh
 from graphloc.solve.linearised import linearised, normal_solver, sparse_rows, with_left_out
 
-_ROUNDS = 3  # of turning the IMU and solving again, at most: they end where what is left is below `_MATTERS`; a choice
-_MATTERS, _TOLD = 0.5, 1.5  # sigmas of the mount, and of what is known of it: less is in the bounds
-_MOST = 5.0  # sigmas of the mount: what speaks for more is another error
+# Most rounds of turning the IMU and solving again; they end where what is left is below `_MATTERS`; a choice.
+_ROUNDS = 3
+# Sigmas of the mount, and of what is known of it, from which it is turned: less is in the bounds.
+_MATTERS, _TOLD = 0.5, 1.5
+_MOST = 5.0  # most sigmas of the mount that it is turned by: what speaks for more is another error
 
 
 class MountError(NamedTuple):
-    """What a run says of the mount of its IMU, beyond how it was solved, and how its N states follow.
+    """What a run says of the error of its IMU's mount, beyond how it was solved, and how its N states follow.
 
     Attributes:
         yaw_rad: most probable turn about the body's z. sigma_rad: of it.
         mean_square: (3,) of the turn about each axis, body axes, rad^2.
-        pose: (N, 6, 3) change of each pose (rotation, translation; body axes) per turn. velocity: (N, 3, 3) the same, world axes.
+        pose: (N, 6, 3) change of each pose (rotation, translation; body axes) per turn.
+        velocity: (N, 3, 3) change of each velocity, world axes, per turn.
     """
 
     yaw_rad: float
@@ -54,7 +60,7 @@ class MountError(NamedTuple):
     velocity: Array
 
     def pose_covariance(self, R: Array, lever_m: Array) -> Array:
-        """Return what it adds to the covariance (N, 6, 6) of the place of a point of the body, and of the attitude, in axes of world.
+        """Return what the mount adds to the covariances (N, 6, 6) of a point of the body and of the attitude, world.
 
         Args:
             R: (N, 3, 3) attitudes. lever_m: (3,) the point from the IMU, body axes.
@@ -64,12 +70,12 @@ class MountError(NamedTuple):
         return np.asarray((by * self.mean_square) @ by.transpose(0, 2, 1))
 
     def velocity_covariance(self) -> Array:
-        """Return what it adds to the covariance (N, 3, 3) of the velocity, world axes."""
+        """Return what the mount adds to the covariance (N, 3, 3) of the velocity, world axes."""
         return np.asarray((self.velocity * self.mean_square) @ self.velocity.transpose(0, 2, 1))
 
 
 def mount_sigma_rad(problem: Problem) -> float:
-    """Return how far the mount of the IMU may be off, 1 sigma."""
+    """Return the configured sigma of the IMU's mount, rad."""
     return float(problem.config.sensors[problem.imu.sensor].mount_sigma_rad)
 
 
@@ -90,7 +96,7 @@ def mount_error(
     n = len(problem.timeline)
     told = follows = _followed(*sparse_rows(graph, values), n)
     if any(stream.left_out is not None for stream in problem.streams):
-        # The graph takes their drift for motion, which would speak for a mount as if it were none.
+        # The graph takes the drift of these for motion, which would speak for a turned mount as if it were true.
         _, J, b = linearised(*with_left_out(problem, values), verdicts, prior).weighed()
         told = _followed(J, b, n)
     cov = np.linalg.inv(told.left.T @ told.left + np.eye(3) / sigma**2)
@@ -107,9 +113,10 @@ def mount_error(
 def followed_before(
     problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior: StartPrior, k: int
 ) -> Array | None:
-    """Return by how much (9, 3) rotation, place and velocity of the IMU at state k, axes of world, follow the turn by the data before it.
+    """Return how (9, 3) rotation, place and velocity of the IMU at state k, world axes, follow the turn of its mount.
 
-    None where the mount is taken as given. Arguments and errors as of `mount_error`.
+    It is by the data before that state. None where the mount is taken as given. Arguments and errors as of
+    `mount_error`.
     """
     if mount_sigma_rad(problem) == 0.0:
         return None
@@ -127,7 +134,11 @@ def followed_before(
 
 
 class _Followed(NamedTuple):
-    """How the states (columns, 3) of a linear system follow the turn, what is left in its rows (rows, 3), and these rows' b."""
+    """How a linear system follows the turn of the IMU's mount.
+
+    Attributes:
+        states: (columns, 3) change of the states. left: (rows, 3) what they leave of the turn in the rows. b: (rows,).
+    """
 
     states: Array
     left: Array
@@ -135,21 +146,22 @@ class _Followed(NamedTuple):
 
 
 def _followed(J: Any, b: Array, n: int) -> _Followed:
-    """Return how the n states follow."""
+    """Return how a linear system J (rows, columns), b (rows,) of n states follows the turn of the IMU's mount."""
     c = by_turn(J, n)
     X = -normal_solver(J)(J.T @ c)
     return _Followed(X, c + J @ X, b)
 
 
 def by_turn(J: Any, n: int) -> Array:
-    """Return c (rows, 3) of the module's text. The factors of the IMU between the n states come first in J (rows, columns), and poses last.
+    """Return c (rows, 3) of the module's text.
 
-    Beside these the levelling alone has an attitude and a bias.
+    In J (rows, columns), the factors of the IMU between the n states come first, and the poses last. Of the other
+    factors, the levelling alone has both an attitude and a bias.
     """
     U = np.zeros((J.shape[1], 3))
     U[-6 * n :].reshape(n, 6, 3)[:, :3] = np.eye(3)
     c, links = np.asarray(J @ U), 9 * (n - 1)
-    biases = np.flatnonzero(abs(J[:links, : -9 * n]).sum(axis=0))  # all that the IMU has beside poses and velocities
+    biases = np.flatnonzero(abs(J[:links, : -9 * n]).sum(axis=0))  # columns in its rows besides poses and velocities
     levelling = np.asarray(abs(J[links:, biases]).sum(axis=1)).ravel() > 0.0
     c[links:][~levelling] = 0.0
     return c
@@ -158,9 +170,14 @@ def by_turn(J: Any, n: int) -> Array:
 def with_mount_estimated(
     problem: Problem, settled: Settled, prior: StartPrior, progress: Progress, most: int
 ) -> tuple[Problem, Settled, StartPrior, MountError | None]:
-    """Return the problem with the yaw of its IMU's mount as is most probable, settled in at most `most` passes; as they are if that is near.
+    """Turn the mount of the IMU to its most probable yaw, and settle the run again.
 
-    And what that says of the mount; None where it is taken as given, or not determined.
+    Args:
+        most: most passes to settle it.
+
+    Returns:
+        The problem, its solution and prior, all unchanged where the mount is near; and the error of the mount by that
+            solution, None where the mount is taken as given, or not determined.
     """
     last, sigma = len(problem.timeline) - 1, mount_sigma_rad(problem)
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of the IMU by the cost of a solved run, and by its residuals: how many times the configured one explains them.
+"""Noise of the IMU by the cost of a solved run, and by its residuals: the factor that explains them.
 
-Values of a data sheet, where engine and hull shake it: the solution then follows the IMU's noise, and is too sure. The cost of the
-whole run hardly shows it, as most of it is of the other sensors.
+If engine and hull shake an IMU that is configured by its data sheet, the solution follows the IMU's noise, and is too
+sure. The cost of the whole run hardly shows it, as most of it is of the other sensors.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ from graphloc.solve.decide import Verdicts
 from graphloc.solve.linearised import linearised, normal_solver, normal_solver_and_log_det
 
 Solved = tuple[Any, Array, Callable[[Array], Array]]
-"""J, weighted; residuals (rows,); and the solution of J'J x = y."""
+"""J, weighted; residuals (rows,); and a function of y that solves J'J x = y."""
 Parts = tuple[NDArray[np.intp], ...]
-"""Rows of each part of a system."""
+"""Row numbers of each part of a system."""
 
 _DRAWS = 16  # random vectors for the estimate of a trace
 _NOISE_ROUNDS, _LEAST_FREEDOM, _UNLIKELY = 5, 3.0, 1e-4
-_UNLIKELY_IF_SCATTERED = 1e-2  # where the samples themselves say that the noise is larger
-_FEWEST = 200  # samples that show how they scatter; how surely, ten times as many (`imu_scatter.FEWEST`)
-_MOST_STEP = 3.0  # that a round changes the noise by
+_UNLIKELY_IF_SCATTERED = 1e-2  # this is enough where the samples themselves say that the noise is larger
+_FEWEST = 200  # fewest samples that show how much they scatter; how surely, ten times as many (`imu_scatter.FEWEST`)
+_MOST_STEP = 3.0  # largest factor on the noise in a round
 LEAST_TIMES = 1.5
-"""The noise must be so many times as large to be taken."""
+"""Least factor by which the noise is raised: if it is smaller, the configured noise stays."""
 CONTRADICTION = 2.5
 """Cost over its expectation from which the configured noise is not believed."""
 LARGEST_NOISE_SCALE = 10.0
-"""No IMU is so many times noisier than configured."""
+"""Largest credible factor on the noise: no IMU is so many times noisier than configured."""
 
 
 def noise_step(ratio: float) -> float:
     """Return the factor by which the noise is scaled up at once where the cost is `ratio` times its expectation.
 
-    At most by 3: modes and weights are chosen anew before it is looked at again.
+    It is 3 at most: modes and weights are chosen anew before the cost is looked at again.
     """
     return float(np.clip(np.sqrt(ratio), 1.5, 3.0))
 
 
 class ImuMisfit(NamedTuple):
-    """Of the gyroscope, and of the accelerometer."""
+    """Misfit of the gyroscope, and of the accelerometer."""
 
     gyroscope: Misfit
     accelerometer: Misfit
@@ -63,10 +63,10 @@ def imu_misfit(
     """Return the misfit of gyroscope and accelerometer, and by what factor other noise would explain it.
 
     Args:
-        unweighted, b: J (rows, columns) and right side (rows,) before weighting. root: (rows,) of the weights.
-        solved: the run with these. links: the number of IMU factors, which come first, nine rows each: attitude (gyroscope), position,
-            velocity.
-        most: largest factors that are looked for; 1: only whether the noise is smaller.
+        unweighted, b: J (rows, columns) and right side (rows,) before weighting. root: (rows,) roots of the weights.
+        solved: the run with these weights.
+        links: number of IMU factors, which come first, nine rows each: attitude (gyroscope), position, velocity.
+        most: largest factor that is looked for, of each; 1: only whether the noise is smaller.
     """
     rows = np.arange(9 * links).reshape(-1, 9)
     own = rows[:, :3].ravel(), rows[:, 3:].ravel()
@@ -92,13 +92,15 @@ def components(
     high: NDArray[np.bool_],
     most: Sequence[float],
 ) -> tuple[Array, Array]:
-    """Return by what factor the noise of parts of the rows explains their residuals, and the freedom that they have with it.
+    """Return the factors on the noise of parts of the rows that explain their residuals, and the freedom with these.
 
-    With other noise the share of the other rows changes, so the factor is found in some rounds (variance components, Helmert).
+    With other noise the share of the other rows changes, so the factors are found in some rounds (variance components,
+    Helmert).
 
     Args:
-        system: J (rows, columns), root of the weights (rows,), b (rows,) before weighting. found: `squares_and_freedom` with these.
-        low, high: of each part, whether less is looked for, or more, at most `most` times as much.
+        system: J (rows, columns), roots of the weights (rows,), b (rows,), J and b before weighting.
+        found: `squares_and_freedom` of this system.
+        low, high: of each part, whether a factor below 1 is looked for, and one above 1, at most `most`.
     """
     (unweighted, root, b), (squares, freedom), needed = system, found, np.ones(len(parts))
     for _ in range(_NOISE_ROUNDS if (low | high).any() else 0):
@@ -116,7 +118,10 @@ def components(
 
 
 def squares_and_freedom(solved: Solved, parts: Parts) -> tuple[Array, Array]:
-    """Squared residuals of parts of the rows, and the trace of 1 - J (J'J)^-1 J' over each (Hutchinson, random signs)."""
+    """Return the squared residuals of parts of the rows, and the parts' degrees of freedom.
+
+    The latter are the trace of 1 - J (J'J)^-1 J' over each part (Hutchinson, random signs).
+    """
     rng, (J, r, solve) = np.random.default_rng(0), solved
     signs = [rng.choice(np.array([-1.0, 1.0]), (len(part), _DRAWS)) for part in parts]
     back = np.hstack([J[part].T @ s for part, s in zip(parts, signs, strict=True)])
@@ -126,10 +131,11 @@ def squares_and_freedom(solved: Solved, parts: Parts) -> tuple[Array, Array]:
 
 
 def log_likelihood(J: Any, b: Array, links: int, gyro: float, accel: float) -> float:
-    """Return the restricted log-likelihood, but for a constant, of a linear system if the noise of its IMU factors is so many times as large.
+    """Return the restricted log-likelihood of a linear system whose IMU factors have more noise, up to a constant.
 
     Args:
         J, b: (rows, columns), (rows,), whitened with the noise as it is. links: as for `imu_misfit`.
+        gyro, accel: factors on that noise.
     """
     weight = np.ones(len(b))
     weight[: 9 * links] = np.tile(np.repeat([1.0 / gyro, 1.0 / accel], [3, 6]), links)
@@ -140,7 +146,10 @@ def log_likelihood(J: Any, b: Array, links: int, gyro: float, accel: float) -> f
 
 
 def scattered(imu: ImuSeries, config: Any, noise_scale: float) -> Array:
-    """Return how many times the configured noise the samples of gyroscope and accelerometer scatter (2,); 1 where they are too few."""
+    """Return (2,) by what factor the samples of gyroscope and accelerometer scatter more than their configured noise.
+
+    1 where they are too few.
+    """
     if len(imu) < _FEWEST:
         return np.ones(2)
     scatter = np.array([noise_density(imu.stamps_ns, columns)[0] for columns in (imu.gyro_radps, imu.accel_mps2)])
@@ -148,10 +157,10 @@ def scattered(imu: ImuSeries, config: Any, noise_scale: float) -> Array:
 
 
 def with_needed_noise(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior: StartPrior) -> Problem | None:
-    """Return the problem with as much IMU noise as its residuals need, where that is clearly more than it has; else None.
+    """Return the problem with as much IMU noise as its residuals need, if that is clearly more than it has; else None.
 
-    Only where the samples themselves scatter more, and no more than they do: other causes of a misfit have other cures. That they
-    scatter is not enough: vibration does not go on into the motion.
+    The noise is raised only where the samples themselves scatter more, and only up to that: other causes of a misfit
+    have other cures. Scatter alone is not enough, because vibration does not go on into the motion.
     """
     imu, config = problem.imu, problem.config.sensors[problem.imu.sensor]
     most = scattered(imu, config, problem.noise_scale)
@@ -170,7 +179,7 @@ def with_needed_noise(problem: Problem, values: gtsam.Values, verdicts: Verdicts
 
 
 def too_quiet(name: str, stated: Any, taken: Any) -> str:
-    """Return a line on an IMU whose noise is configured too small, and what is taken instead; empty where it is not.
+    """Return a warning on an IMU whose noise is configured too small, and on what is taken; empty if it is not.
 
     Args:
         stated, taken: its configuration, and that with the noise that is taken.

@@ -11,11 +11,11 @@ from graphloc.measurements import Measurement
 from graphloc.recording import Recording
 from graphloc.solve.decide import AGREES, Verdict
 
-_FALSE = 0.05  # a hypothesis below this probability is rejected, not just down-weighted
+_FALSE = 0.05  # a measurement that is right with less probability is rejected, not just down-weighted
 
 
 def ledger_of(problem: Problem, recording: Recording, verdicts: dict[tuple[int, int], Verdict]) -> Ledger:
-    """Return what became of each message: rows of the recording, of the builder, and one for each verdict."""
+    """Return what became of each message: rows of the recording and of the builder, and one for each verdict."""
     ledger = Ledger(recording.rows)
     for row in problem.rejected:
         if row.seq >= 0:

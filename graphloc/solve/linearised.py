@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A solved run as a sparse linear system J dx = b in whitened rows, for questions that the graph itself does not answer."""
+"""A solved run as a sparse linear system J dx = b in whitened rows, for questions that the graph does not answer."""
 
 from __future__ import annotations
 
@@ -20,11 +20,15 @@ from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision
 from graphloc.solve.decide import Verdicts
 
-_LEAST_WEIGHT = 1e-6  # as of a linear factor (`linear.linear_update`), so that no row vanishes
+_LEAST_WEIGHT = 1e-6  # as for a linear factor (`linear.linear_update`), so that no row vanishes
 
 
 class Weighed(NamedTuple):
-    """A linear system J dx = b (rows, columns), (rows,) by its losses, and the root of the weight of each row (rows,)."""
+    """A linear system J dx = b, weighted by its losses.
+
+    Attributes:
+        root: (rows,) roots of the weights. J: (rows, columns), sparse. b: (rows,).
+    """
 
     root: Array
     J: Any
@@ -36,8 +40,9 @@ class Rows:
     """The run in whitened rows, J dx = b, without losses.
 
     Attributes:
-        J: (rows, columns), sparse. b: (rows,). states: poses, whose columns come last; before them their velocities.
-        starts: first row of each factor, and of the end. stamps_ns: (rows,) when each row is.
+        J: (rows, columns), sparse. b: (rows,).
+        states: number of poses, whose columns come last, after those of their velocities.
+        starts: first row of each factor, and of the end. stamps_ns: (rows,) time of each row.
         made: range of factors of each measurement. kernels: factors that share a loss, and the loss.
     """
 
@@ -50,7 +55,10 @@ class Rows:
     kernels: list[tuple[range, KernelConfig]]
 
     def weighed(self, misfit: Array | None = None) -> Weighed:
-        """Return the system with the weights that the losses give the rows at a misfit (rows,); by default at that of the estimate, -b."""
+        """Return the system with the weights that its losses give at a misfit (rows,).
+
+        By default that is the misfit of the estimate, -b.
+        """
         misfit = -self.b if misfit is None else misfit
         total, root = np.concatenate([[0.0], np.cumsum(misfit**2)]), np.ones(len(misfit))
         for factors, kernel in self.kernels:
@@ -63,10 +71,11 @@ class Rows:
         return [i for i in range(len(stream.measurements)) if (stream.number, i) in self.made]
 
     def moved(self, stream: Stream, used: list[int], shift: Array) -> Array:
-        """Return by how much (rows, c) the rows change if M measurements, and nothing else, are taken with their states moved.
+        """Return by how much (rows, c) the rows change if M measurements see their states moved, and nothing else does.
 
         Args:
-            used: indices of the M measurements. shift: (M, 9, c), rotation and translation in body axes, velocity in world.
+            used: indices of the M measurements. shift: (M, 9, c), rotation and translation in body axes, velocity in
+                world.
         """
         B = np.zeros((len(self.b), shift.shape[2]))
         spans = [self.made[(stream.number, i)] for i in used]
@@ -120,7 +129,7 @@ def linearised(problem: Problem, values: gtsam.Values, verdicts: Verdicts, prior
 
 
 def with_left_out(problem: Problem, values: gtsam.Values) -> tuple[Problem, gtsam.Values]:
-    """Return the problem with the slow errors that were left out as states, and a copy of the values with them at zero."""
+    """Return the problem with the left-out slow errors as states, and a copy of the values with these at zero."""
     values, streams = gtsam.Values(values), []
     for stream in problem.streams:
         if (slow := stream.left_out) is not None:
@@ -144,7 +153,10 @@ def sparse_rows(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tupl
 
 
 def _attached(problem: Problem, stream: Stream, i: int, at: Attachment, values: gtsam.Values) -> Attachment:
-    """Return an attachment of the solution, with the slow states and constants that the stream has here: the same where they are."""
+    """Return an attachment of the solution with the slow states and constants that its stream has in this problem.
+
+    It is the same object where these are the same.
+    """
     constants = at.constants if stream.constants else ()
     if stream.slow is None:
         return replace(at, constants=constants, slow_key=None, slow_value=None, slow_next=None)
@@ -163,7 +175,10 @@ def _jumps(problem: Problem, held: list[Any]) -> list[int]:
 
 
 def _stamps_ns(problem: Problem, held: list[Any]) -> NDArray[np.int64]:
-    """Return the stamp (ns) of each factor: that of its first state. The prior of a leaf comes before the factor that connects it."""
+    """Return the stamp (ns) of each factor: that of its earliest state.
+
+    The prior of a leaf has none, and takes that of the next factor, which connects the leaf.
+    """
     nodes = problem.timeline.slow_stamps_ns.tolist()
     at = {key(k): n for key in (keys.pose, keys.velocity) for k, n in enumerate(problem.timeline.stamps_ns.tolist())}
     at |= {keys.bias(j): n for j, n in enumerate(nodes)}
@@ -175,12 +190,12 @@ def _stamps_ns(problem: Problem, held: list[Any]) -> NDArray[np.int64]:
 
 
 def normal_solver(J: Any) -> Callable[[Array], Array]:
-    """Return the solution of J'J x = y as a function of y."""
+    """Return a function of y that solves J'J x = y."""
     return normal_solver_and_log_det(J)[0]
 
 
 def normal_solver_and_log_det(J: Any) -> tuple[Callable[[Array], Array], float]:
-    """Return the solution of J'J x = y as a function of y, and the logarithm of the determinant of J'J."""
+    """Return a function of y that solves J'J x = y, and the logarithm of the determinant of J'J."""
     N = (J.T @ J).tocsc()
     scale = 1.0 / np.sqrt(N.diagonal())
     scaled = (diags_array(scale) @ N @ diags_array(scale)).tocsc()

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Predictions of the residuals of one sensor, jointly: the measurements share the error of the predicted estimate.
 
-This error is modelled as a smooth process of unit variance in each of m independent directions. A root (k, m) per measurement
-maps it to the residual, so that a right measurement conditions the prediction of the next (Gaussian conditioning). Without
-this, two measurements that contradict each other would both fit a loose prediction, and two that agree to centimetres, with a
-prediction that is 20 m off, would look like a repeated false error.
+This error is modelled as a smooth process of unit variance in each of m independent directions. A root (k, m) per
+measurement maps it to the residual, so that a right measurement conditions the prediction of the next (Gaussian
+conditioning). Without this, two measurements that contradict each other would both fit a loose prediction. And two that
+agree to centimetres, with a prediction that is 20 m off, would look like a repeated false error.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from graphloc.graph import Attachment, FalseModel, Residual
 from graphloc.measurements import Measurement
 
 _LASTS_S = 60.0  # largest correlation time of the error of a prediction
-# How fast the offset of an estimate in the wrong place may move besides: a random walk of this share of a false
-# error's size in a second (0.1 m of 5 m).
+# Additional random walk of the offset of an estimate in the wrong place: in a second this share of a false error's size
+# (0.1 m of 5 m).
 _OFFSET_WALK = 0.02
 
 
 class PredictedResidual(NamedTuple):
-    """A residual, its prediction conditioned on the right measurements before it.
+    """The residuals of a measurement, predicted conditional on the right measurements before it.
 
     Attributes:
         modes: residual of each mode, less the expected error.
         cov: (k, k) of the remaining error; None: the measurement took part in the estimate.
-        possible: False where it contradicts the chain of measurements taken for right.
+        possible: False where the measurement contradicts the chain of measurements taken for right.
     """
 
     modes: tuple[Residual, ...]
@@ -44,7 +44,8 @@ class Prediction(NamedTuple):
     """The prediction of a residual.
 
     Attributes:
-        root: (k, m), root of its covariance. lasts_s: correlation time of the error: sigma of position over that of velocity.
+        root: (k, m), root of its covariance.
+        lasts_s: correlation time of its error, s: sigma of position over that of velocity.
     """
 
     root: Array
@@ -60,9 +61,11 @@ def prediction_of(residual: Residual, at: Attachment, P: Array, velocity_cov: Ar
     """Return the prediction of a residual.
 
     Args:
-        P: (m, m) of the state's pose in the body tangent (6) and of the sensor's slow state, where it has one; also for a residual
-            that does not depend on the latter (a tag on the quay beside those of a dock), so that all roots have the same width.
-        velocity_cov: (3, 3), (m/s)^2. Where velocity is less certain than position (at a start), the error changes quickly.
+        P: (m, m) of the state's pose in the body tangent (6) and of the sensor's slow state, where it has one. The
+            latter is in it also for a residual that does not depend on it (a tag on the quay beside those of a dock),
+            so that all roots have the same width.
+        velocity_cov: (3, 3), (m/s)^2. Where velocity is less certain than position (at a start), the error changes
+            quickly.
     """
     J = residual.jacobian()
     if (others := len(P) - J.shape[1]) > 0:
@@ -92,8 +95,8 @@ def predict_residuals(
     """Return the residuals of N measurements, each predicted conditional on the right ones before it.
 
     Args:
-        predictions: N, or None where the measurement took part in the estimate.
-        chain: N modes that are taken for right (see `best_chain`), or None.
+        predictions: N; None for a measurement that took part in the estimate.
+        chain: N modes that are taken for right (see `best_chain`); None: the measurement is not.
     """
     assert stream.row.false is not None
     chained = any(mode is not None for mode in chain)
@@ -123,16 +126,20 @@ def predict_residuals(
 
 
 def kept_of(before_s: Array, now_s: float, ages_s: Array) -> Array:
-    """Return the correlation (J,) between the errors of two predictions with these correlation times: smooth, as of an integrated velocity."""
+    """Return the correlation (J,) between the errors of two predictions: smooth, as of an integrated velocity.
+
+    Args:
+        before_s: (J,) correlation times of the earlier ones. now_s: that of the later one. ages_s: (J,) in between.
+    """
     return np.asarray(np.exp(-0.5 * (ages_s / np.maximum(np.minimum(before_s, now_s), 1e-6)) ** 2))
 
 
 def carried(raw: Array, cov: Array, roots: Array, root: Array, kept: Array) -> tuple[Array, Array]:
-    """Return mean (J, k) and covariance (J, k, k) of the error in a residual, conditional on each of J right ones before it.
+    """Return mean (J, k) and covariance (J, k, k) of a residual's error, conditional on each of J right ones before it.
 
     Args:
-        raw: (J, k) residuals. cov: (J, k, k) of the measurements. roots: (J, k, m). kept: (J,), see `kept_of`.
-        root: (k, m) of the residual in question.
+        raw: (J, k) residuals before it. cov: (J, k, k) of their measurements. roots: (J, k, m) of their predictions.
+        root: (k, m) of the prediction of the residual in question. kept: (J,), see `kept_of`.
     """
     cross = kept[:, None, None] * (roots @ root.T)  # (J, k before, k now)
     gain = np.linalg.solve(cov + roots @ roots.transpose(0, 2, 1), cross).transpose(0, 2, 1)
@@ -140,7 +147,7 @@ def carried(raw: Array, cov: Array, roots: Array, root: Array, kept: Array) -> t
 
 
 def moved(before: Prediction | None, now: Prediction | None, age_s: float) -> Array | float:
-    """Return the covariance (k, k) of the change of the error from one residual to the next."""
+    """Return the covariance (k, k) of the change of the prediction's error from one residual to the next."""
     if before is None or now is None:
         alone = before or now
         return 0.0 if alone is None else alone.cov
@@ -152,12 +159,12 @@ def moved(before: Prediction | None, now: Prediction | None, age_s: float) -> Ar
 
 
 def walk_of(model: FalseModel) -> Array:
-    """Return the covariance (k, k) that an offset gains per second in addition."""
+    """Return the covariance (k, k) that the offset of an estimate in the wrong place gains in addition, per second."""
     return np.asarray(_OFFSET_WALK**2 * model.cov)
 
 
 def taken_of(stream: Judged, indices: Sequence[int]) -> tuple[list[Measurement], list[FalseModel]]:
-    """Return measurements of a sensor with hypotheses, and the error model of each."""
+    """Return measurements of a sensor with hypotheses, and the model of each one's error if it is false."""
     assert stream.row.false is not None
     taken = [stream.measurements[i] for i in indices]
     return taken, [stream.row.false(m, stream.config) for m in taken]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of fixes, poses and matches by how their residuals scatter from one to the next: how many times what they state.
+"""Noise of fixes, poses and matches by how their residuals change from one to the next: the factor on what they state.
 
-Covariances are often made up, or those of a peak's curvature. Of poses that state too little, right ones are judged false, and those that
-happen to lie near the estimate hold it there; of fixes, the noise counts against the IMU. In differences, an error that measurements share
-(a drift, an image that is off) has no part; and as some are false, or jump, the factor is that of the likeliest mixture of right pairs
-and others.
+Covariances are often made up, or those of a peak's curvature. If poses state too little, right ones are judged false,
+and those that happen to lie near the estimate hold it there; if fixes do, their noise counts against the IMU.
+Differences do not contain an error that measurements share (a drift, an image that is off). As some measurements are
+false, or jump, the factor is that of the most likely mixture of right pairs and others.
 """
 
 from __future__ import annotations
@@ -21,25 +21,29 @@ from graphloc.graph import Residual
 from graphloc.measurements import Measurement
 from graphloc.solve.decide import Verdicts
 
-_PAIRED_S = 10.0  # apart at most: over longer, the error of the estimate changes, too
-_FEWEST, _MOST = 15, 2000  # pairs
-_FALSE_M = 5.0  # what a sensor without hypotheses errs by where it errs
+_PAIRED_S = 10.0  # longest time between the two of a pair: over longer, the error of the estimate changes, too
+_FEWEST, _MOST = 15, 2000  # pairs: with fewer, nothing is said; more are not used
+_FALSE_M = 5.0  # sigma of an error that is not noise, of a sensor without hypotheses
 _FACTORS = np.geomspace(1.0, 20.0, 16)
-# Of right pairs. With fewer, those that err by their noise could all be false by little, and no noise would show.
+# Shares of right pairs. If there could be fewer, those that err by their noise could all be false by little, and no
+# noise would show.
 _SHARES = np.linspace(0.3, 0.95, 8)
-_ERRORS = (0.2, 0.4, 0.8, 1.6, 3.2)  # times the error that is expected of a false one
-_ANY_SIZE = 0.1  # share of the others that err by any of these sizes, and not by the one of most
-_LEAST_TIMES = 1.4  # so the first of `_FACTORS` above 1, 1.22, is none: stated sigmas are rarely better known; a choice
-_SURE = 8.0  # log-likelihood that a factor must gain
-_SURE_IF_DENIED = 0.0  # where the IMU contradicts the sensors: half a minute of fixes tells no more, and else it would be called noisier
+_ERRORS = (0.2, 0.4, 0.8, 1.6, 3.2)  # sizes of a false one's error, in times of what is expected
+_ANY_SIZE = 0.1  # share of the false pairs that err by any of these sizes, not by the most likely one
+# The first of `_FACTORS` above 1, 1.22, is taken as 1: stated sigmas are rarely better known; a choice.
+_LEAST_TIMES = 1.4
+_SURE = 8.0  # log-likelihood that another factor must gain
+# The same where the IMU contradicts the sensors: half a minute of fixes tells no more, and else the IMU would be
+# blamed.
+_SURE_IF_DENIED = 0.0
 
 
 class Step(NamedTuple):
-    """From one residual to the next, on the axes (k) that one key of the configuration scales.
+    """The change from one residual to the next, on the axes (k) that one key of the configuration scales.
 
     Attributes:
-        key: of the configuration.
-        change: (k,). stated: (k, k), its covariance as stated. error: (k, k), covariance of the error of a false one.
+        key: of the configuration. change: (k,) of the residual. stated: (k, k), covariance of `change` as stated.
+        error: (k, k), covariance of the error of a false measurement.
     """
 
     key: str
@@ -49,14 +53,15 @@ class Step(NamedTuple):
 
 
 Pair = tuple[Step, ...]
-"""Two residuals in a row: their steps, one of each key."""
+"""Two residuals in a row: their steps, one for each key."""
 
 
 def scattering(problem: Problem, verdicts: Verdicts, *, denied: bool = False) -> dict[str, dict[str, float]]:
-    """Return by what factors fixes, poses and matches scatter more than they state, where clearly: by sensor and key of its configuration.
+    """Return by what factors fixes, poses and matches clearly scatter more than stated, by sensor and key.
 
     Args:
-        denied: whether the IMU contradicts the sensors, so that one of them is noisier than configured.
+        verdicts: on all measurements.
+        denied: whether the IMU contradicts the sensors, so that either is noisier than configured.
     """
     found = {}
     for stream in problem.streams:
@@ -94,12 +99,13 @@ def _error(stream: Judged, m: Measurement, axes: int) -> Array:
 def times_stated(
     pairs: Iterable[Pair], now: Mapping[str, float] | None = None, *, sure: float = _SURE
 ) -> dict[str, float]:
-    """Return by key how many times its stated sigma a sensor scatters, where it is clearly more.
+    """Return, by key, how many times its stated sigma a sensor scatters, where that is clearly more.
 
     Args:
-        now: factors that are taken now; they stay, but where others are clearly likelier. sure: log-likelihood that others must gain.
+        now: factors that are taken at present; they stay unless others are clearly more likely.
+        sure: log-likelihood that others must gain.
     """
-    alike: dict[tuple[tuple[str, int], ...], list[Pair]] = {}  # with and without height, with and without heading
+    alike: dict[tuple[tuple[str, int], ...], list[Pair]] = {}  # by what they have: height or not, heading or not
     for pair in pairs:
         alike.setdefault(tuple((step.key, len(step.change)) for step in pair), []).append(pair)
     kinds, most = max(alike.items(), key=lambda item: len(item[1]), default=((), []))
@@ -116,14 +122,16 @@ def times_stated(
 
 
 def _likeliest(steps: Sequence[Sequence[Array]], now: Sequence[float], sure: float) -> list[float]:
-    """Return the likeliest factor on the stated sigmas of M steps, of each key; what it is now where no other is clearly likelier.
+    """Return, for each key, the most likely factor on the stated sigmas of M steps, or the present one.
 
-    Keys share which pairs are right: where positions tell false ones, the angles of the others show their noise. How far most of the
-    others err is what explains them best if the right ones err as stated, so that errors which are merely of another size make no noise.
+    The latter if no other is clearly more likely. Keys share which pairs are right: where positions tell false ones,
+    the angles of the others show their noise. By how much most of the others err is what explains them best if the
+    right ones err as stated, so that errors which are merely of another size do not look like noise.
 
     Args:
-        steps: of each key, its changes, stated covariances and errors (see `Step`), each with one more axis (M) in front.
-        now: factor of each key. sure: log-likelihood that another must gain.
+        steps: of each key, its changes, stated covariances and errors (see `Step`), each with one more axis (M) in
+            front.
+        now: present factor of each key. sure: log-likelihood that another must gain.
     """
     right, other = np.zeros((1, len(steps[0][0]))), np.zeros(len(steps[0][0]))  # (factors of each key, M), (M,)
     tried = [_factors(times) for times in now]
@@ -146,13 +154,17 @@ def _likeliest(steps: Sequence[Sequence[Array]], now: Sequence[float], sure: flo
 
 
 def _factors(now: float) -> Array:
-    """Return the factors that are tried, in steps of the same ratio: from none up to as many times what it is now."""
+    """Return the factors that are tried, at a constant ratio, from 1 up to 20 times the present one."""
     more = int(np.ceil(np.log(now) / np.log(_FACTORS[1])))
     return np.asarray(_FACTORS[1] ** np.arange(len(_FACTORS) + more))
 
 
 def _log_likelihoods(right: Array, other: Array) -> Array:
-    """Return those of M pairs, by log densities of right ones (..., M) and of others (M,), with the likeliest share of right ones."""
+    """Return the log-likelihoods (...) of M pairs, with the most likely share of right ones.
+
+    Args:
+        right, other: log densities of right pairs (..., M), and of others (M,).
+    """
     mixed = [np.logaddexp(np.log(share) + right, np.log1p(-share) + other).sum(axis=-1) for share in _SHARES]
     return np.asarray(np.max(mixed, axis=0))
 

@@ -25,13 +25,16 @@ from graphloc.build import (
 from graphloc.frames import Array
 from graphloc.solve._optimize import optimize
 
-_MOVED_M, _MOST_TIMES = 0.3, 4  # distance at which factors are linearised again, and how often at most
+_MOVED_M, _MOST_TIMES = 0.3, 4  # motion from which factors are linearised again, and how often at most
 
 
 class StretchStep(NamedTuple):
-    """One optimisation of a window: what came out, iterations, final error, how far any pose moved.
+    """One optimisation of a window.
 
-    `made`: where the factors of each measurement stand in the graph.
+    Attributes:
+        values: the result. graph: the graph that it comes from. made: range of the factors of each measurement in the
+            graph.
+        iterations: number of those that it took. error: final one, nats. moved_m: how far any pose moved.
     """
 
     values: gtsam.Values
@@ -56,7 +59,9 @@ def solve_stretch(
 ) -> StretchStep:
     """Optimise states first..last in place, roughly: the passes over the whole run do the rest.
 
-    `beside`: a factor (gtsam.NonlinearFactor) that is no part of the run.
+    Args:
+        decided: decisions on the measurements. prior, jumps: as of `build_graph`. tol: as of `optimize`.
+        beside: a factor (gtsam.NonlinearFactor) that is no part of the run; None: there is none.
     """
     made: Made = {}
     graph, guess = build_graph(problem, values, decided, first, last, prior, jumps=jumps, made=made)
@@ -80,8 +85,8 @@ def solve_until_written_there(
 ) -> StretchStep:
     """Repeat `solve_stretch` while the solution moves away from where its factors were linearised.
 
-    Factors of sensors with hypotheses are linear about the estimate. Linearised a metre away, a right sighting leaves the solution
-    tenths of a metre off, and judged there it looks false.
+    Factors of sensors with hypotheses are linear about the estimate. Linearised a metre away, a right sighting leaves
+    the solution tenths of a metre off, and judged there it looks false.
     """
     begin, iterations = values.extract(state_keys(problem, first, last)), 0
     for _ in range(_MOST_TIMES):
@@ -94,7 +99,7 @@ def solve_until_written_there(
 
 
 def _written_anew(problem: Problem, values: gtsam.Values, first: int, last: int, decided: Decisions) -> Decisions:
-    """Return the decisions of a stretch with the attachments of sensors with hypotheses at the present estimate."""
+    """Return the decisions of a stretch, those of sensors with hypotheses attached at the present estimate."""
     written = dict(decided)
     for stream in problem.streams:
         if stream.row.false is not None:
@@ -105,8 +110,9 @@ def _written_anew(problem: Problem, values: gtsam.Values, first: int, last: int,
 
 
 def moved(old: gtsam.Values, new: gtsam.Values) -> float:
-    """How far any pose moved, m (1 rad counts as 10 m)."""
-    # Where measurements contradict each other grossly, the first steps may be huge: an overflow to infinity is meant here.
+    """Return how far any pose moved, m (1 rad counts as 10 m)."""
+    # Where measurements contradict each other grossly, the first steps may be huge: an overflow to infinity is
+    # intended.
     with np.errstate(over="ignore"):
         apart = gtsam.utilities.extractPose3(new) - gtsam.utilities.extractPose3(old)  # (poses, 9 of R and 3)
         # Two rotations by an angle a apart differ by 2 sqrt(2) sin(a / 2), squares of all nine summed.
@@ -123,15 +129,16 @@ def update_states(problem: Problem, values: gtsam.Values, new: gtsam.Values, fir
 
 
 def copy_states(problem: Problem, values: gtsam.Values, first: int, last: int) -> gtsam.Values:
-    """Return the values of states first..last and of their slow states."""
+    """Return the values of states first..last, of their slow states, and of constants."""
     constants = [key for key in every_constant(problem.streams) if values.exists(key)]
     return values.extract(state_keys(problem, first, last) + constants)
 
 
 def unwound(problem: Problem, values: gtsam.Values) -> gtsam.Values:
-    """Return the values of a run with the yaws of its sensors' mounts within half a turn; these same where they are.
+    """Return the values of a run with the yaws of its sensors' mounts within half a turn; the same object if they are.
 
-    While the heading is found such a yaw may go round, by whole turns that nothing tells; its prior then hardly leads back.
+    While the heading is searched such a yaw may go round by whole turns, which nothing measures; its prior then hardly
+    leads back.
     """
     found = values
     for stream in problem.streams:
@@ -153,7 +160,11 @@ def slow_at(problem: Problem, values: gtsam.Values, j: int) -> dict[int, Array]:
 
 
 def fill_slow(problem: Problem, values: gtsam.Values, j: int, bias: Any, slow: dict[int, Array]) -> None:
-    """Set the bias and the slow errors at slow node j: those of `slow`, and 0 of other streams."""
+    """Set the bias and the slow errors at slow node j.
+
+    Args:
+        slow: slow errors by stream number; those of other streams are set to 0.
+    """
     values.insert_or_assign(keys.bias(j), bias)
     for stream in problem.streams:
         if stream.slow is not None:
@@ -190,7 +201,7 @@ def weak_prior(problem: Problem, values: gtsam.Values, k: int) -> StartPrior:
 
 
 def past_at(problem: Problem, step: StretchStep, k: int) -> Past:
-    """Return the joint prior that a solved stretch gives for state `k`, the first one of its slow node, from data before it.
+    """Return the joint prior of a solved stretch on state `k`, the first of its slow node, by the data before it.
 
     Measurements from that state on are left out: the next stretch has them, and they would count twice.
     """

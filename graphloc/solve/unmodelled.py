@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the slow errors that are left out of a solved run (`Stream.left_out`) do to its attitude and velocity.
 
-Nothing tells such an error d from motion, so the estimate follows it: in position by all of it, in heading and velocity by as
-much as the IMU lets it. In the linearised run J dx = b the fixes contain B d, so the estimate is off by
+Nothing tells such an error d from motion, so the estimate follows it: in position by all of it, in heading and velocity
+as far as the IMU lets it. In the linearised run J dx = b the fixes contain B d, so the estimate is off by
 
     dx = (J'J)^-1 J'B d
 
@@ -28,14 +28,18 @@ _DRAWS, _AT_ONCE = 64, 16  # a sigma from 64 draws is good to 9 %; so many at on
 
 
 class Unmodelled(NamedTuple):
-    """Covariances of rotation, rad^2, and velocity, m^2/s^2, (N, 3, 3) each, in world axes, that come on top."""
+    """Covariances to add, (N, 3, 3) each, in world axes.
+
+    Attributes:
+        rotation: rad^2. velocity: m^2/s^2.
+    """
 
     rotation: Array
     velocity: Array
 
 
 def unmodelled(result: BatchResult) -> Unmodelled | None:
-    """Return what left-out slow errors add to the covariances; None where there is none.
+    """Return what left-out slow errors add to the covariances; None if no slow error is left out.
 
     Raises:
         RuntimeError: a state is not determined.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warnings: what in the solution contradicts the configuration, or each other."""
+"""Warnings: what in the solution contradicts the configuration, or itself."""
 
 from __future__ import annotations
 
@@ -27,20 +27,25 @@ from graphloc.solve.imu_mount import MountError, mount_sigma_rad
 from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE, too_quiet
 from graphloc.time import NS_PER_S, stamps_of, utc_text
 
-_TURNED, _TOLD = 2.5, 0.1  # sigmas; share of a prior's variance
-_MUCH_NOISIER = 1.5  # times what is stated, from which it is said: bounds would be a third too small; a choice
-_SMALL_M = 0.1  # a slow error below it is that of RTK
-_TOGETHER_S = 5.0  # refused ones that last as long are said, where as many are false in a row by chance only
-_BY_CHANCE = 1e-3  # anywhere in the run; a choice
-_UNAIDED_S = 30.0  # at an end of the run, from which the IMU alone is metres off
-# Sigmas of its random walk over that: smoothed, a bias that walks so moves by less than two. More than the 3 from which `bias_walk` looks
-# closer: there a test of the whole run decides as well, and costs nothing where it denies; here the user is asked to act on this alone.
+# Sigmas from which a mount is said to be turned; share of a prior's variance that others must take off it.
+_TURNED, _TOLD = 2.5, 0.1
+_MUCH_NOISIER = 1.5  # times what is stated, from which a warning is given: bounds would be a third too small; a choice
+_SMALL_M = 0.1  # a slow error that is smaller is that of RTK
+_TOGETHER_S = 5.0  # shortest row of refused measurements that is said, if so many in a row are unlikely to be false
+_BY_CHANCE = 1e-3  # probability below which that is unlikely, anywhere in the run; a choice
+_UNAIDED_S = 30.0  # length of an end of the run, from which the IMU alone is metres off
+# Sigmas of the random walk over `WANDERS_S` from which a bias is said to wander: one that walks as configured moves,
+# smoothed, by less than two. It is more than the 3 from which `bias_walk` looks closer: there a test of the whole run
+# decides as well, and costs nothing where it denies; here the user is asked to act on this alone.
 _WANDERS_SAID = 4.0
-_LEVELS_M = 0.5  # sigma, for levels that may be the usual ones as well: said from there on
+_LEVELS_M = 0.5  # sigma for levels that may be the usual ones as well, from which it is said
 
 
 def slow_error_warning(sensor: str, left_out: SlowProcess | None, *, without_height: bool) -> list[str]:
-    """Say what a slow error that nothing can tell from motion does to the bounds, and to its heights; nothing if it is that of RTK."""
+    """Return what a slow error that nothing can tell from motion does to the bounds and to the use of heights.
+
+    Nothing is said of bounds if the error is as small as that of RTK.
+    """
     said = list[str]()
     if left_out is not None and left_out.sigma[0] >= _SMALL_M:
         said.append(
@@ -55,7 +60,11 @@ def slow_error_warning(sensor: str, left_out: SlowProcess | None, *, without_hei
 
 
 def disagreement_warning(sensor: str, weights: Array) -> list[str]:
-    """Say where most measurements (N,) of a sensor disagree with the rest: a line, or none."""
+    """Return a warning where most measurements of a sensor disagree with the rest, or none.
+
+    Args:
+        weights: (N,) of its measurements.
+    """
     share = float((weights < AGREES).mean()) if len(weights) else 0.0
     if share <= 0.5 or len(weights) <= 10:
         return []
@@ -63,7 +72,7 @@ def disagreement_warning(sensor: str, weights: Array) -> list[str]:
 
 
 def noisier_warning(sensor: str, noisier: float) -> list[str]:
-    """Say where a sensor is taken to be `noisier` times as noisy as it states: a line, or none."""
+    """Return a warning where a sensor is taken to be `noisier` times as noisy as it states, or none."""
     if noisier < _MUCH_NOISIER:
         return []
     cure = "set its sigma or the floor of it accordingly (a compass also use_reported_sigma: false)"
@@ -72,7 +81,7 @@ def noisier_warning(sensor: str, noisier: float) -> list[str]:
 
 
 def scale_warning(sensor: str, stated: SensorConfig, taken: SensorConfig) -> list[str]:
-    """Say where factors on a sensor's sigmas are taken to be larger than configured: a line, or none."""
+    """Return a warning where factors on a sensor's sigmas are taken to be larger than configured, or none."""
     times = taken.sigmas_over(stated)
     if not times:
         return []
@@ -85,10 +94,10 @@ def scale_warning(sensor: str, stated: SensorConfig, taken: SensorConfig) -> lis
 
 
 def joint_rejection_warning(sensor: str, stamps_ns: NDArray[np.int64], weights: Array, false: Array) -> list[str]:
-    """Say where more measurements (N,) in a row are refused than false ones come together by chance: a line, or none.
+    """Return a warning where more measurements in a row are refused than are false together by chance, or none.
 
     Args:
-        false: (N,) probability of each that it is false.
+        stamps_ns, weights: (N,) of the measurements. false: (N,) probability of each that it is false.
     """
     chance = np.concatenate([[0.0], np.cumsum(np.log(np.maximum(false, 1e-6)))])
     rows = [
@@ -106,14 +115,17 @@ def joint_rejection_warning(sensor: str, stamps_ns: NDArray[np.int64], weights: 
 
 
 def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
-    """How many of its sigmas a constant slow state (a mount's offset) lies from zero, 0 where there is none; which, where, and what to do."""
+    """Return how many of its sigmas a constant slow state (a mount's offset) lies from zero, and a text on it.
+
+    0 where there is none. The text says which, where, and what to do.
+    """
     slow = stream.slow
     if slow is None:
         return 0.0, ""
     value = result.values.atVector(keys.slow(stream.number, 0))
     far = np.where(slow.constant, np.abs(value) / slow.sigma, 0.0)
     if slow.late is not None:
-        far[slow.late] = 0.0  # it is no mount (`late_far_off`)
+        far[slow.late] = 0.0  # a delay is no mount (`late_far_off`)
     k = int(np.argmax(far))
     where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.3g} {slow.units[k]}"
     cure = "check its mount and the IMU's, or raise the configured sigma"
@@ -126,10 +138,11 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
 
 
 def _turned_mount(stream: Stream, result: BatchResult) -> list[str]:
-    """Return a line if the other sensors say that headings are turned by more than the mount's sigma and theirs allow.
+    """Return a warning if, by the other sensors, headings are turned by more than the mount's sigma and theirs allow.
 
-    Two sensors that may each be turned share between them what they differ by, and neither lies far from zero: of 4 deg between mounts good to
-    1 deg each is 2 deg off, 2.8 sigmas of what they should differ by. So what the others alone say is taken, its variance with it.
+    Two sensors that may each be turned share what they differ by, and neither lies far from zero: with 4 deg between
+    mounts good to 1 deg, each is 2 deg off, 2.8 sigmas of what they should differ by. So the turn by the other sensors
+    alone is taken, with its variance.
     """
     slow = stream.slow
     if slow is None or (k := slow.mount_yaw) is None:
@@ -138,7 +151,7 @@ def _turned_mount(stream: Stream, result: BatchResult) -> list[str]:
     value, sigma = float(result.values.atVector(key)[k]), float(slow.sigma[k])
     var = float(result.cov[key][k, k])
     prior = sigma**2 * (1.0 + (value / sigma) ** 2 / CONSTANT_TAILS)
-    told = prior - var  # what the other sensors took off it
+    told = prior - var  # variance that the other sensors took off it
     if told < _TOLD * prior:
         return []
     others, others_var = value * prior / told, var * prior / told
@@ -156,7 +169,7 @@ def _turned_mount(stream: Stream, result: BatchResult) -> list[str]:
 
 
 def _noisier(stream: Stream, result: BatchResult) -> float:
-    """How many times the stated noise a sensor with a kernel is taken to have."""
+    """Return how many times its stated noise a sensor with a kernel is taken to have."""
     if stream.row.false is not None:
         return 1.0
     found = [result.verdicts[stream.number, i].decision for i in range(len(stream.measurements))]
@@ -164,9 +177,9 @@ def _noisier(stream: Stream, result: BatchResult) -> float:
 
 
 def mount_warning(problem: Problem, error: MountError) -> list[str]:
-    """Say where the other sensors have the yaw of the IMU's mount farther off than its sigma and theirs allow: a line, or none.
+    """Return a warning where, by the other sensors, the IMU's mount has more yaw than sigmas allow, or none.
 
-    What is left of the turn is shrunk by its prior, and scatters by what the others take off that.
+    The estimated turn is shrunk by its prior, so its scatter is what the other sensors take off the prior's variance.
     """
     sigma = mount_sigma_rad(problem)
     turn, told = float(problem.imu_turn_rad[2]) + error.yaw_rad, sigma**2 - error.sigma_rad**2
@@ -179,7 +192,7 @@ def mount_warning(problem: Problem, error: MountError) -> list[str]:
 
 
 def mount_event(problem: Problem) -> tuple[str, ...]:
-    """Say so where the run was solved with the mount of the IMU turned: a line, or none."""
+    """Return a line if the run was solved with the mount of the IMU turned, or none."""
     turn_deg = float(np.degrees(problem.imu_turn_rad[2]))
     name = problem.imu.sensor
     return (
@@ -225,7 +238,10 @@ def _of_the_run(problem: Problem, result: BatchResult, expected: float) -> list[
 
 
 def _unaided_ends(problem: Problem) -> list[str]:
-    """Return a line on each end of the run at which nothing measures position or velocity for long, where the IMU alone carries the track."""
+    """Return a warning on each end of the run at which nothing measures position or velocity for long.
+
+    There the IMU alone carries the track.
+    """
     aided_ns = [m.stamp_ns for stream in problem.streams if stream.row.company for m in stream.measurements]
     first_ns, last_ns = (int(stamp_ns) for stamp_ns in problem.timeline.stamps_ns[[0, -1]])
     if not aided_ns:
@@ -241,9 +257,10 @@ def _unaided_ends(problem: Problem) -> list[str]:
 
 
 def _wandering_biases(problem: Problem, result: BatchResult) -> list[str]:
-    """Return a line on biases that wander by far more than their random walk allows, where that is not to be raised.
+    """Return a warning on biases that wander far more than their random walk allows, where that is not to be raised.
 
-    Axes that gravity shows tell it. The rate about the vertical wanders as much, unseen where nothing measures the heading.
+    Axes that gravity shows tell it. The rate about the vertical wanders as much, unseen where nothing measures the
+    heading.
     """
     config, warnings = problem.config.sensors[problem.imu.sensor], list[str]()
     if config.adapt_noise:
@@ -260,7 +277,7 @@ def _wandering_biases(problem: Problem, result: BatchResult) -> list[str]:
 
 
 def noise_warnings(problem: Problem, result: BatchResult) -> list[str]:
-    """Say of which sensors the noise is taken to be larger than configured.
+    """Return warnings on sensors whose noise is taken to be larger than configured.
 
     Args:
         problem: as configured.
@@ -296,12 +313,12 @@ def noise_warnings(problem: Problem, result: BatchResult) -> list[str]:
 
 
 def far_off(name: str, constant: Constant, value: Array, mount: Any) -> Iterator[tuple[str, float, str]]:
-    """Yield each setting of a sensor that is far from where an estimate (k,) of its constant has it: its key, by how much, and a line.
+    """Yield each setting of a sensor that is far from its estimate: its key, by how much, and a line.
 
-    Of what another sensor has, too, that one says it.
+    A setting that another sensor shares is yielded by one of them only.
 
     Args:
-        mount: of the sensor (gtsam.Pose3).
+        value: (k,) estimate of the constant. mount: of the sensor (gtsam.Pose3).
     """
     found = corrections([(constant, value)], mount)
     for n, key in constant.settings:
@@ -310,7 +327,7 @@ def far_off(name: str, constant: Constant, value: Array, mount: Any) -> Iterator
 
 
 def late_far_off(name: str, slow: SlowProcess | None, late_s: float) -> list[str]:
-    """Say where the stamps of a sensor are far from where they are set, by the estimate that its slow state has of it: a line, or none."""
+    """Return a warning where the delay of a sensor's stamps, by its slow state, is far from its setting, or none."""
     if slow is None or slow.late is None:
         return []
     off = abs(late_s) / float(slow.sigma[slow.late])
@@ -322,7 +339,7 @@ def _add_to(name: str, key: str, by: float, off: float) -> str:
 
 
 def _lasting_error(stream: Stream, verdicts: Sequence[Verdict]) -> list[str]:
-    """Return a line if poses share errors that count as independent."""
+    """Return a warning if poses share errors that count as independent, or none."""
     if not isinstance(stream.config, PoseConfig) or (found := lasting(stream, verdicts)) is None:
         return []
     said = f"{stream.name}: its errors last for some {found.time_s:.0f} s, by its residuals, and count as independent"

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is the IMU wrong for a while? Offline: as a run is grown, a window in which it contradicts the other sensors is solved without it.
+"""Is the IMU wrong for a while? Offline: a grown window in which it contradicts the other sensors is solved without it.
 
-A wrong unit, a loose plug, a saturated axis: no noise of the IMU explains it, and with more of it the whole run is spoiled. Nor does
-one sensor that is wrong: so two of them at least must agree in the solution without the IMU that do not with it, and the motion there
-must be one that a vessel may make. The span is as short as it can be without contradicting them again. Online: `graphloc.online._imu_doubt`.
+A wrong unit, a loose plug, a saturated axis: no noise of the IMU explains these, and with more noise the whole run is
+spoiled. Nor is one sensor that is wrong a reason to doubt the IMU. So at least two sensors must agree in the solution
+without the IMU that do not agree with it, and the motion there must be one that a vessel may make. The span is as short
+as it can be without contradicting them again. Online: `graphloc.online._imu_doubt`.
 """
 
 from __future__ import annotations
@@ -27,19 +28,24 @@ from graphloc.solve.stretch import copy_states, dead_reckon
 from graphloc.time import NS_PER_S, duration_ns, utc_text
 
 WRONG_IMU = "contradicts the other sensors, which agree with each other"
-# Squares of an IMU factor that make it one; and how many times those of the window before.
+# Square of an IMU factor, in sigmas, from which it is a contradiction; and how many times the usual one it must be.
 _SUSPECT, _TIMES = 36.0, 30.0
-_BEFORE_S = 2.5  # what is known before a window may be wrong already
-_PRICE, _CLEARLY = 1.0, 30.0  # log-likelihood: of each IMU factor that is left out, and of leaving out any
+_BEFORE_S = 2.5  # length of the end of what is known before a window that may be wrong already
+# Log-likelihood: price of each IMU factor that is left out, and least gain of leaving out any.
+_PRICE, _CLEARLY = 1.0, 30.0
 _WORSE = 6.0  # log-likelihood by which a shorter span may be less probable
-GROWS = 4.0  # times the square of the first residual in a row
-_IN_A_ROW = 3  # measurements of a sensor that disagree make it one that denies
-_SENSORS, _FEWEST = 2, 2  # that agree without the IMU, and with how many measurements more
-_MOTION = 3.0  # sigmas of the motion in a gap, once and per second
+GROWS = 4.0  # a residual grows if its square reaches so many times that of the first in a row
+_IN_A_ROW = 3  # measurements in a row that disagree make their sensor one that denies
+_SENSORS, _FEWEST = 2, 2  # sensors that must agree without the IMU, each with so many more measurements
+_MOTION = 3.0  # sigmas of the motion in a gap, at once and for each second
 
 
 class ImuWrong(Exception):
-    """The IMU is wrong in some spans (after one stamp until another, ns)."""
+    """The IMU is wrong in some spans.
+
+    Attributes:
+        spans: each after one stamp until another, ns.
+    """
 
     def __init__(self, spans: Sequence[tuple[int, int]]) -> None:
         super().__init__(spans)
@@ -60,7 +66,10 @@ def left_out(recording: Recording, spans: Sequence[tuple[int, int]]) -> tuple[Re
 
 
 def most_motion(length_s: float) -> float:
-    """Return the squared motion that a vessel may make in a gap of the IMU, in sigmas of what is expected there (`factors.imu`)."""
+    """Return the squared motion that a vessel may make in a gap of the IMU of some length (s).
+
+    It is in sigmas of what is expected there (`factors.imu`).
+    """
     return _MOTION**2 * (1.0 + length_s)
 
 
@@ -84,7 +93,11 @@ class GrownWindow(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """A window solved without the IMU between two of its states: the problem, the cost, and the values of its states."""
+    """A window solved without the IMU between two of its states.
+
+    Attributes:
+        problem: without the IMU there. cost: of the window, nats. values: of its states.
+    """
 
     problem: Problem
     cost: float
@@ -92,11 +105,12 @@ class _Found(NamedTuple):
 
 
 def wrong_span(window: GrownWindow, before: gtsam.Values, solve: Callable[[Problem], object]) -> tuple[int, int] | None:
-    """Return where the IMU is wrong in a window that has been solved: after one stamp until another (ns); None: it is not.
+    """Return where the IMU is wrong in a solved window: after one stamp until another (ns); None: it is not.
 
     Args:
-        window: at the end its values are those without the IMU there.
-        before: its states up to `known`, as solved without what is new. solve: solves the window of a problem, in place.
+        window: its values become those without the IMU there.
+        before: its states up to `known`, as solved without the new data. solve: solves the window of a problem, in
+            place.
     """
     problem, values, first, known, last, _ = window
     begin = max(first + 1, problem.timeline.floor(int(problem.timeline.stamps_ns[known]) - duration_ns(_BEFORE_S)))
@@ -121,10 +135,11 @@ def wrong_span(window: GrownWindow, before: gtsam.Values, solve: Callable[[Probl
 
 
 class _Trials:
-    """Solutions of a window without the IMU in parts of it; other arguments as of `wrong_span`.
+    """Solutions of a window without the IMU in parts of it.
 
     Args:
-        begin: the first state from which it may be wrong. agreed: of each stream, which measurements since agree with the window as it is.
+        window, before, solve: as of `wrong_span`. begin: the first state from which the IMU may be wrong.
+        agreed: of each stream, which measurements from there on agree with the window as it is.
 
     Attributes:
         as_is: the states of the window as it is.
@@ -145,7 +160,7 @@ class _Trials:
     def without(self, a: int, b: int) -> _Found:
         """Solve the window without the IMU from state `a` to `b`, in place.
 
-        Not from the window as solved, whose biases may be bent as far back as it reaches.
+        It does not start from the window as solved, whose biases may be bent as far back as it reaches.
         """
         problem, values, first, known, last, _ = self._window
         values.update(self.as_is)
@@ -159,7 +174,11 @@ class _Trials:
         return _Found(rest, cost, copy_states(rest, values, first, last))
 
     def explains(self, a: int, b: int, found: _Found) -> bool:
-        """Whether it is clearly more probable, by several sensors and a motion that a vessel may make."""
+        """Return whether a solution without the IMU is clearly more probable, by several sensors and a possible motion.
+
+        Args:
+            a, b: states between which the IMU is left out. found: the solution.
+        """
         if found.cost > self._cost - _CLEARLY:
             return False
         stamps_ns = found.problem.timeline.stamps_ns
@@ -171,20 +190,23 @@ class _Trials:
 
 
 def _contradicted(problem: Problem, values: gtsam.Values, first: int, begin: int, last: int) -> bool:
-    """Whether a factor of the IMU costs far more than usual."""
+    """Return whether a factor of the IMU costs far more than usual."""
     squares = np.array([2.0 * problem.inertial[k].error(values) for k in range(first, last)])
     usual = float(np.median(squares[: max(begin - first, 1)]))
     return bool(squares[begin - first :].max(initial=0.0) > max(_SUSPECT, _TIMES * usual))
 
 
 def _denies(agreed: NDArray[np.bool_]) -> bool:
-    """Whether several in a row disagree."""
+    """Return whether several measurements in a row disagree."""
     in_a_row = np.convolve(~agreed, np.ones(_IN_A_ROW), "valid") if len(agreed) >= _IN_A_ROW else np.zeros(1)
     return bool(in_a_row.max() > _IN_A_ROW - 0.5)
 
 
 def _grows(agreed: NDArray[np.bool_], squares: Array) -> bool:
-    """Whether a residual grows while several in a row disagree: what is off by the same throughout has jumped, as all that one receiver tells."""
+    """Return whether the residual of a sensor grows while several measurements in a row disagree.
+
+    A residual that stays the same is of a jump: all that one receiver gives jumps at once, and the IMU is not to blame.
+    """
     begin = int(np.argmax(np.convolve(~agreed, np.ones(_IN_A_ROW), "valid")))
     ends = np.flatnonzero(agreed[begin:])
     row = squares[begin : begin + int(ends[0]) if len(ends) else len(squares)]
@@ -201,12 +223,12 @@ def _shortest(
 
     a = _farthest(lambda middle: good(middle, last), begin, last)
     b = _farthest(lambda middle: good(a, middle), last, a)
-    a, b = max(a - 1, begin), min(b + 1, last)  # the ends as found may be wrong for a part of a state's time
+    a, b = max(a - 1, begin), min(b + 1, last)  # the IMU may be wrong in a part of the steps beside
     return (a, b), without(a, b)
 
 
 def _farthest(good: Callable[[int], bool], known: int, wrong: int) -> int:
-    """Return how far from `known` towards `wrong` it is still good, by bisection."""
+    """Return the state farthest from `known` towards `wrong` that is still good, by bisection."""
     while abs(wrong - known) > 1:
         middle = (known + wrong) // 2
         known, wrong = (middle, wrong) if good(middle) else (known, middle)
@@ -216,9 +238,9 @@ def _farthest(good: Callable[[int], bool], known: int, wrong: int) -> int:
 def _agreeing(
     problem: Problem, values: gtsam.Values, first: int, last: int
 ) -> tuple[list[NDArray[np.bool_]], list[Array]]:
-    """Return which measurements of each stream agree with an estimate, by its kernel as configured, and their squared residuals, in sigmas.
+    """Return which measurements of each stream agree with an estimate, and their squared residuals, in sigmas.
 
-    Of several modes the nearest.
+    They agree by the kernel as configured; of several modes the nearest counts.
     """
     found, squares = list[NDArray[np.bool_]](), list[Array]()
     for stream in problem.streams:
