@@ -107,8 +107,8 @@ class Entries:
     def information(self, stream: LiveStream, since: int) -> Array:
         """Return the information of the measurements of a stream, from index `since` on, as judged.
 
-        It is (9, 9), on rotation, position and velocity in axes of world; if the stream's slow error is estimated, (9 +
-        k, 9 + k) with that. Jumps of a slow error that is otherwise left out count as known.
+        It is (9, 9), on rotation, position and velocity in axes of world. If the stream's slow error is estimated, it
+        is (9 + k, 9 + k), with that. Jumps of a slow error that is otherwise left out count as known.
         """
         width = 9 if stream.slow is None or stream.left_out is not None else 9 + len(stream.slow.sigma)
         total = np.zeros((width, width))

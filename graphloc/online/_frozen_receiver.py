@@ -120,8 +120,7 @@ def _motion(t: Array, places_m: Array, sigma_m: float) -> tuple[float, float, fl
         t: (N,) times, s. places_m: (N, 2). sigma_m: stated noise of a place.
 
     Returns:
-        Speed (m/s), noise of a place (m; the stated one, or the scatter if that is smaller), and noise of the speed
-            (m/s).
+        Speed (m/s), noise of a place (m; the stated one, or the scatter if that is smaller), noise of the speed (m/s).
     """
     line = line_fit(t, places_m)
     noise_m = min(

@@ -8,7 +8,7 @@ The last 40 s are fitted, with horizontal vectors as complex numbers, east + i n
 - place: of the antenna, by its fixes; it has a step where these jump.
 - reckoned: place by dead reckoning: the specific force in axes propagated by the gyroscope, integrated twice, plus the
   lever arm.
-- ahead = exp(i yaw); ahead2 and ahead3 are it, integrated twice and three times.
+- ahead: exp(i yaw). ahead2, ahead3: ahead integrated twice and three times.
 - a, b: position and velocity. c, d: gravity, by a tilt that is wrong or changes.
 - f, g: biases of the accelerometer and the gyroscope. Their priors are about 0, not about the estimated biases, which
   are wrong too where the heading is.
@@ -266,8 +266,7 @@ class HeadingCheck:
 
         Returns:
             Times (N,), s, relative to the newest state; and (3 or 4, N) complex: reckoned, ahead2, ahead3 and, where
-                `place_m` is not 0,
-            ahead, in axes of world by the newest state's attitude.
+            `place_m` is not 0, ahead, in axes of world by the newest state's attitude.
         """
         lever_m = _mount_m(lag, self._sensor) if place_m else _lever_m(lag, self._sensor)
         # In the body's axes at the first step ("start"), without gravity.

@@ -332,8 +332,7 @@ class LiveProblem:
 
         Returns:
             The motion from the state before the stamp to it, None at a state; the raw angular rate (3,), rad/s; and
-                `felt` (6,), as of a
-            `build.Stream`.
+            `felt` (6,), as of a `build.Stream`.
         """
         floor = self.timeline.floor(stamp_ns)
         at_ns = self.timeline.stamps_ns[floor]

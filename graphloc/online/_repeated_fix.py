@@ -72,7 +72,7 @@ class RepeatedFixDetector:
 
         Returns:
             The stamp (ns) from which the fixes before this one turn out to have been old, because this one jumps on;
-                else None.
+            else None.
         """
         last, turned_out = self._last, None
         if last is not None and stamp_ns <= last[0]:

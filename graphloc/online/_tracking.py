@@ -452,8 +452,7 @@ class Tracking:
             until_ns: stamp of the newest IMU sample.
 
         Returns:
-            None: nothing has changed. Else the window was rebuilt, and this is a line for users; empty: it was said
-                before.
+            None: nothing has changed. Else the window was rebuilt, and this is a line for users; empty: users know it.
         """
         denied, replaced, anchors = self.lag.denied, self.lag, self._anchors()
         since_ns = self._doubt.suspected(denied, until_ns) if denied else None
