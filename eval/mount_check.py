@@ -19,7 +19,7 @@ from graphloc.recording import Recording
 from graphloc.trajectory import Trajectory, bounds_95
 
 _MOVES_MPS = 1.0  # speed below which a vessel may well drift sideways
-_CREEPS_MPS = 0.3  # the same of a robot
+_CREEPS_MPS = 0.3  # the same for a craft that never goes as fast, as a robot
 # Least spread of the headings; and largest spread of the angle between course and heading over that, which is 1 if a
 # current sets the craft.
 _TURNS, _STEADIER = 0.02, 0.25

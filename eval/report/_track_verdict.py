@@ -28,9 +28,9 @@ from graphloc.trajectory import Trajectory, bounds_95
 _MOSTLY = 0.5  # least share whose health is good
 _LOST = 0.05  # largest share whose health is lost
 _COVERED = 0.85  # least share of the truth inside the 95 % bounds: below, these are too small
-_NOT_COVERED = 0.5  # the same; below, no bound can be relied on
+_NOT_COVERED = 0.5  # least share of the truth inside them: below, no bound can be relied on
 _MATCHED = 0.95  # least share of the reference that the track covers
-_STARTED = 0.8  # the same online, where the start waits for position and heading
+_STARTED = 0.8  # least share that an online track covers, whose start waits for position and heading
 _TOO_SURE = 4.0  # NEES from which bounds are too small: errors are 1.4 times what the covariance says
 # Least share of the time in which the online 95 % bounds hold the offline position. Honest bounds do for at least 95 %,
 # as the offline track is better informed.

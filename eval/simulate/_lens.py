@@ -56,7 +56,7 @@ def draw_drops(rng: np.random.Generator, camera: RigCamera, duration_s: float) -
 
 
 def exposure(picture: Picture, camera: RigCamera) -> tuple[float, float]:
-    """Return exposure (ms) and gain that make the mean grey, as far as both go."""
+    """Return exposure (ms) and gain that make the mean grey, as far as their limits allow."""
     light = picture[::8, ::8]
     scale = _MIDDLE_GREY / max(float(light.mean()), 1e-9)
     for _ in range(8):  # iterated, as clipped pixels count as white only

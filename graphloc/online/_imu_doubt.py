@@ -2,7 +2,7 @@
 """Is the IMU wrong: a wrong unit, a loose plug, a saturated axis? Sensors then deny the estimate together.
 
 A single sensor that disagrees is itself in doubt, and its kernel takes its weight. Two that begin to disagree within
-seconds of each other have one thing in common: the motion by the IMU since the state that both agreed with. So the
+seconds of each other have one thing in common: the motion by the IMU since the state that they agreed with. So the
 samples since then are tried as an IMU gap (`Tracking.doubt_imu`). They are left out if the sensors agree without them,
 by a motion that a vessel may have made.
 

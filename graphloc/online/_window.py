@@ -272,7 +272,7 @@ class Window:
                 cov = np.asarray(self._solver.jointMarginalCovariance(list(keys)).fullMatrix())
         except (RuntimeError, IndexError, ValueError) as error:
             raise not_solved("the covariance could not be computed", error) from error
-        # The solver's tangents are at its linearisation points; turn those of the poses to the estimate.
+        # The solver's tangents are at its linearisation points; turn the tangents of poses to the estimate.
         for n, key in enumerate(itertools.takewhile(is_pose, keys)):
             turn = self.values.atPose3(key).rotation().matrix().T @ self.linearised_at(key).rotation().matrix()
             for rows in (slice(6 * n, 6 * n + 3), slice(6 * n + 3, 6 * n + 6)):
