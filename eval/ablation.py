@@ -17,7 +17,7 @@ from graphloc.signals.series import rms
 from graphloc.solution import Solution
 from graphloc.trajectory import Trajectory, bounds_95
 
-CONTRADICTS = 2.0  # sigmas between a sensor and the rest from which on it is said
+CONTRADICTS = 2.0  # sigmas between a sensor and the rest, from which a contradiction is reported
 
 Basis = str
 """'truth', 'held' (fixes kept out) or 'full' (the solution with all sensors)."""
@@ -25,7 +25,11 @@ Basis = str
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Off:
-    """Distances from the reference over time: stamps (N,), horizontal m, heading deg or None."""
+    """Distances of a track from the reference over time.
+
+    Attributes:
+        stamps_ns: (N,). off_m: (N,) horizontal. off_deg: (N,) of the heading; None: the reference has none.
+    """
 
     stamps_ns: NDArray[np.int64]
     off_m: Array
@@ -37,13 +41,15 @@ class Effect:
     """Result with all sensors (`without` is '') or without one.
 
     Attributes:
-        measurements: number of the sensor's in the recording (0: the configuration makes them).
-        rmse_m, worst_m, heading_rmse_deg: distances from the reference. worst_at_s: since the run's begin.
+        without: name of the sensor. measurements: number of its measurements in the recording; 0: they are made from
+            the configuration.
+        rmse_m, worst_m, heading_rmse_deg: distances from the reference. worst_at_s: when, since the run's begin.
         bound_m, bound_deg: median 95 % bounds of the solution. missing: share of the full track that it lacks.
-        cost_ratio: cost over its expectation. contradiction: of the sensor with this solution, in sigmas
-            (`graphloc.eval.consistency`).
-        fits: by other sensor, how far its used measurements are from this solution, in its own sigmas.
-        why_not: why there is no solution without it.
+        cost_ratio: cost over its expectation.
+        contradiction: distance of the left-out sensor from this solution, in sigmas (`graphloc.eval.consistency`).
+        apart_m, apart_deg: median of the same distance, if the sensor measures such.
+        fits: by sensor, how far its used measurements are from this solution, in its own sigmas.
+        why_not: why there is no solution; empty: there is one.
     """
 
     without: str
@@ -65,7 +71,12 @@ class Effect:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vote:
-    """Two sensors that contradict the rest, and the distance of each from a solution without both, in sigmas."""
+    """Two sensors that contradict the rest.
+
+    Attributes:
+        one, other: names. one_off, other_off: distance of each from a solution without the two, in sigmas; None: not
+            known.
+    """
 
     one: str
     other: str
@@ -78,9 +89,11 @@ class Ablated:
     """Result of an ablation.
 
     Attributes:
-        basis: reference of the distances ('truth', 'held' or 'full'). begin_ns: origin of times, begin of the full track.
-        full, effects: with all sensors, and without each. over_time: distances by sensor that is left out.
+        source, vessel: of the recording. basis: reference of the distances ('truth', 'held' or 'full').
+        begin_ns: origin of times, begin of the full track.
+        full, effects: with all sensors, and without each. over_time: distances, by left-out sensor.
         votes: between suspects. matched: sensors whose measurements were made around the full solution.
+        warnings: on the comparison.
     """
 
     source: str
@@ -99,7 +112,7 @@ def off(solution: Solution, full: Solution, truth: Trajectory | None, held: Sequ
     """Compare a solution with truth, else with held-out fixes, else with the solution with all sensors.
 
     Raises:
-        NoCommonTimeError: they share no time.
+        NoCommonTimeError: the solution and its reference share no time.
     """
     if truth is None and held:
         fixes = held_out_errors(solution.trajectory, held, solution.datum, levers).predicted(solution.slow)
@@ -116,7 +129,13 @@ def effect(
     without: str, measurements: int, solution: Solution, full: Solution, away: Off,
     contradicts: Contradiction | None, fits: Mapping[str, float | None],
 ) -> Effect:  # fmt: skip
-    """Return the effect of leaving out a sensor."""
+    """Return the effect of leaving out a sensor.
+
+    Args:
+        without, measurements: as of `Effect`. solution: without the sensor. full: with all sensors.
+        away: distances of `solution` from the reference. contradicts: of the sensor; None: not known. fits: as of
+            `Effect`.
+    """
     track, stats = solution.trajectory, solution.stats
     assert track.cov is not None
     bounds, worst = np.median(bounds_95(track.cov), axis=0), int(np.argmax(away.off_m))

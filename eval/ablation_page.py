@@ -16,11 +16,12 @@ from graphloc.eval.page import Cell, Grid, write_csv, write_markdown, write_page
 from graphloc.eval.plots import COLOURS, TRUTH, Figure, Line, Mark, Panel, Points, peaks
 from graphloc.time import seconds_since
 
-MARK = "ablation.json"  # a folder with this file is ours to replace
-_BETTER = 0.9  # an error without a sensor that is smaller than so many times that with it
-_LEANS, _LEANS_TIMES = 1.3, 3.0  # sigmas, and times the other's, from which on what is left leans against a suspect
+MARK = "ablation.json"  # a folder with this file was written here, and may be replaced
+_BETTER = 0.9  # ratio of the error without a sensor to that with it, below which the run is better without
+# Distance of a suspect from a solution without two suspects, in sigmas and times the other's, from which it is blamed.
+_LEANS, _LEANS_TIMES = 1.3, 3.0
 _LEAST_M = 1e-3  # lower end of a logarithmic axis
-_DIFFERENT_M = 0.02  # differences below are not worth a word
+_DIFFERENT_M = 0.02  # smaller differences are not mentioned
 
 _BASIS = {
     "truth": "Errors are against truth, which was not fused.",
@@ -142,7 +143,7 @@ def _number(value: float | None, unit: str, digits: int = 2) -> Cell:
 
 
 def _count(e: Effect) -> Cell:
-    """Return the number of measurements as text; the height prior has none in the recording."""
+    """Return the number of measurements as text; a sensor whose measurements the configuration makes has none."""
     return Cell(text=str(e.measurements) if e.measurements else "-")
 
 
@@ -168,7 +169,7 @@ def _row(e: Effect) -> tuple[Cell, ...]:
 
 
 def over_time(ablated: Ablated) -> Figure:
-    """Return the figure of distances over time, a line for each sensor that is left out; time since the begin of the track."""
+    """Return the figure of distances over time since the track's begin, a line for each left-out sensor."""
     marks: list[Mark] = []
     for k, (name, away) in enumerate(ablated.over_time.items()):
         step = peaks(away.off_m)
@@ -188,7 +189,7 @@ def write(ablated: Ablated, folder: Path, command: str) -> None:
     title = f"What each sensor bought: {ablated.vessel}, {Path(ablated.source).name}"
     lines, tables = said(ablated), grids(ablated)
     parts = [tables[0].as_html()]
-    if ablated.over_time:  # with one sensor there is no other run to draw
+    if ablated.over_time:  # empty if there is one sensor: then no run without it can be drawn
         parts += ["<h2>Over time</h2>", drawing(over_time(ablated))]
     parts.append(tables[1].as_html())
     write_page(folder / "ablation.html", title, lines, parts)

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Consistency of a sensor with a solution that did not use it.
 
-For each measurement z, in the solution without its sensor:  r = h(x) - z,  S = R + J P J^T + K Q K^T + C B C^T, with R the claimed
-covariance, P the solution's covariance of the pose, Q the stationary covariance of the sensor's own slow error (K: d r / d slow), and B
-that of its constants as configured (C: d r / d constants): place of an antenna, delay of stamps. What a survey of tags does not know is
-in the R of their poses.
+For each measurement z, in the solution without its sensor:
+
+    r = h(x) - z,    S = R + J P J^T + K Q K^T + C B C^T
+
+- R: stated covariance of z; for poses by tags it includes the errors of the survey.
+- P: covariance of the pose by the solution; J = d r / d pose.
+- Q: stationary covariance of the sensor's own slow error; K = d r / d slow.
+- B: configured covariance of its constants (place of an antenna, delay of stamps); C = d r / d constants.
+
 r^T S^-1 r is chi-square with dim r degrees of freedom if these covariances are honest. The measure is
 
     contradiction = sqrt(median of r^T S^-1 r / median of that chi-square)
 
 in sigmas: 1 if all is well, below 1 if slow errors are smaller than they might be. The median is robust against false
-measurements; for a sensor with a share f of them, the quantile 0.5 (1 - f), the median of the others, replaces it.
-Successive residuals share their errors, a constant's all of them, so no significance is stated.
+measurements; for a sensor with a share f of false ones it is replaced by the quantile 0.5 (1 - f), the median of the
+right ones. No significance is stated: successive residuals share slow errors, and all share those of constants.
 """
 
 from __future__ import annotations
@@ -33,8 +38,8 @@ from graphloc.recording import Recording
 from graphloc.solution import Solution
 from graphloc.time import stamps_of
 
-_MOST = 400  # measurements that are looked at
-_STEP = 1e-4  # of slow states, for their Jacobian
+_MOST = 400  # measurements that are evaluated, evenly spaced
+_STEP = 1e-4  # step of a slow state, for its numerical Jacobian
 _FEWEST = 5
 
 
@@ -52,7 +57,11 @@ class _There:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contradiction:
-    """Distance of a sensor from a solution without it: in sigmas, and the median in m and deg, if it measures such."""
+    """Distance of a sensor from a solution without it.
+
+    Attributes:
+        sigmas: the measure. apart_m, apart_deg: median distance in m and in deg; None: the sensor measures no such.
+    """
 
     sigmas: float
     apart_m: float | None
@@ -115,14 +124,14 @@ def _at(solution: Solution, measurements: Sequence[Measurement]) -> list[_There]
                 gyro_radps=solution.gyro_radps[nearest[i]],
                 felt=FeltMotion(
                     R.T @ a_world_mps2[nearest[i]], spin_radps2[nearest[i]], np.zeros(3)
-                ),  # gravity is not in it
+                ),  # acceleration of the motion only, without gravity
             )
         )
     return [found[i] for i in index]
 
 
 def _attachment(solution: Solution, there: _There, t: Array, R: Array) -> Attachment:
-    """Return an attachment to a state at body's origin and at the measurement's stamp, which is not in the graph."""
+    """Return an attachment to a made-up state at body's origin and at the measurement's stamp; it is in no graph."""
     return Attachment(
         pose_key=0,
         velocity_key=0,
@@ -142,7 +151,7 @@ def _attachment(solution: Solution, there: _There, t: Array, R: Array) -> Attach
 
 
 def _nis(m: Measurement, config: object, row: Sensor, at: Attachment, there: _There) -> tuple[float, Residual]:
-    """Return the smallest normalised square of the hypotheses, and that hypothesis."""
+    """Return the smallest r^T S^-1 r among the hypotheses of a measurement, and the residual of that hypothesis."""
     slow, constants = row.slow(config), row.constants(config)
     at = replace(at, constants=tuple((0, np.zeros(len(c.sigma))) for c in constants))
     if slow is not None:
@@ -170,7 +179,7 @@ def _nis(m: Measurement, config: object, row: Sensor, at: Attachment, there: _Th
 
 
 def fit(solution: Solution, name: str) -> float | None:
-    """Return the distance of a sensor's used measurements from a solution with it, in its own sigmas; 1: as it claims."""
+    """Return the distance of a sensor's used measurements from a solution with it, in its own sigmas; 1: as stated."""
     used = [
         (row.nis, row.dof)
         for row in solution.ledger

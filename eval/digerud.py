@@ -7,17 +7,19 @@ State x, vx, y, vy, z, vz of the camera; at each sighting k of the tag, with z_k
     otherwise:                 predict only                            Q = I, the default of the library pykalman
     start:                     x_0 = (z_1, at rest), P_0 = I, and z_1 is then filtered like the others
 
-The gate compares with the state before prediction, as printed (sec. 2.6 compares z with the predicted one). Only a pose near the
-state opens it: if z_1 is the flipped pose, right ones are dropped until the state, which then only flipped poses move, comes
-within 2 m of them: at close range it may (sec. 4.5), otherwise never (sec. 4.4).
+The gate compares z with the state before prediction, as printed in app. B (sec. 2.6 compares it with the predicted
+state). Only a pose near the state passes the gate. If z_1 is the flipped pose, right poses are dropped until the state,
+which only flipped poses then move, comes within 2 m of them. At close range it may (sec. 4.5), otherwise it never does
+(sec. 4.4).
 
-D has the camera in the tag's frame; here it is in world, the tags' frame at rest. With Q, R, P_0 and the gate equal on every axis
-that is the same filter, rotated. It does not model a moving dock: its position in world moves along.
+D's camera position is in the tag's frame; here it is in world, with docks at rest. Since Q, R, P_0 and the gate are
+equal on every axis, this is the same filter, rotated. A moving dock is not modelled: the vessel's position in world
+moves with it.
 
-The pose: sec. 2.7.4 names `cv2.solvePnP` (Levenberg-Marquardt), app. A calls swatbotics' `detection_pose`. Both descend from the
-homography's pose to a nearby minimum of the reprojection error, without a choice between the two. Here both are found and the
-lower one is used: at 5-25 m and 0.3 px it is the flipped one as often as that of `cv2.solvePnP`, within 1 % of sightings (400
-draws at each of 18 positions).
+The pose: sec. 2.7.4 names `cv2.solvePnP` (Levenberg-Marquardt), app. A calls swatbotics' `detection_pose`. The two
+descend from the homography's pose to a nearby minimum of the reprojection error, without choosing between the two
+minima. Here the two minima are found and the lower one is used. At 5-25 m and 0.3 px it is the flipped one as often as
+with `cv2.solvePnP`, within 1 % of sightings (400 draws at each of 18 positions).
 """
 
 from __future__ import annotations
@@ -41,19 +43,21 @@ from graphloc.recording import Recording
 from graphloc.time import NS_PER_S, seconds_between
 from graphloc.trajectory import Trajectory
 
-_H = np.kron(np.eye(3), [1.0, 0.0])  # (3, 6): places of x, vx, y, vy, z, vz
-_DT_S, _GATE_M = 0.04, 2.0  # as printed; the step is the same for every sighting, whatever time passed
+_H = np.kron(np.eye(3), [1.0, 0.0])  # (3, 6): takes x, y, z of x, vx, y, vy, z, vz
+_DT_S, _GATE_M = 0.04, 2.0  # as printed; the step is the same for every sighting, however much time has passed
 _R = 11.0 * np.eye(3)  # of the measured position, m^2
 _FOCAL_PX = 1069.38  # of D's camera; OpenCV refines too little where it is given rays instead of pixels
-_ATTITUDE_RAD = float(np.radians(10.0))  # of a pose at about 10 m, unless it is flipped; the filter has no attitude
+# 1 sigma of the attitude by a pose at about 10 m that is not flipped; the filter has no attitude of its own.
+_ATTITUDE_RAD = float(np.radians(10.0))
 
 
 def run_digerud(recording: Recording, config: VesselConfig) -> FilterResult | None:
-    """Run the filter; None if its tag was sighted less than twice, which does not make a track.
+    """Run the filter; None if its tag was sighted less than twice, which makes no track.
 
-    The track is of the body at the sightings' stamps, with the attitude of the last accepted pose (sigma 10 deg about each axis),
-    so a flip turns the vessel. It has no velocity: the filter's is per 0.04 s, whatever time passed, and would distort the
-    interpolation. P is the filter's own, of the camera. The tag is the one seen most often (D's: 227), by the camera that sees it most.
+    The track is of the body at the sightings' stamps, with the attitude of the last accepted pose (sigma 10 deg about
+    each axis), so a flipped pose turns the vessel. It has no velocity: the filter's own assumes 0.04 s between
+    sightings, and would distort the interpolation. The covariance is the filter's, of the camera. The tag is the one
+    seen most often (D's: 227), by the camera that sees it most.
 
     Args:
         recording: sightings of enabled sensors are used; those of other tags get rows in the ledger.
@@ -91,14 +95,15 @@ def run_digerud(recording: Recording, config: VesselConfig) -> FilterResult | No
         refused = "" if taken else f"outside the {_GATE_M:g} m gate"
         ledger.add(filter_row(m, recording, nis, refused, away_m))
         off_m[m.seq] = _off_m(p_world_camera, m, recording.truth)
-        out[m.stamp_ns] = (state, m.t_body_camera_m)  # two at one stamp: the later has both
+        # Of two sightings at one stamp, the state after the second is kept
+        out[m.stamp_ns] = (state, m.t_body_camera_m)
     if len(out) < 2:
         return None
     return FilterResult(name="Digerud KF", trajectory=_track(out), ledger=ledger, why=_why(ledger, off_m))
 
 
 def _off_m(p_world_camera: Array, m: TagSighting, truth: Trajectory | None) -> float:
-    """Return the camera's position error by a pose: against truth, else against the likeliest pose of all tags in the image."""
+    """Return the error (m) of a camera position: against truth, else against the likeliest pose of all tags in view."""
     there, at = m.modes[0].p_world_camera_m, np.array([m.stamp_ns])
     if truth is not None and truth.covers(at)[0]:
         true = truth.at(at)
@@ -107,10 +112,10 @@ def _off_m(p_world_camera: Array, m: TagSighting, truth: Trajectory | None) -> f
 
 
 def _why(ledger: Ledger, off_m: Mapping[int, float]) -> str:
-    """Return what the gate did: how many poses it dropped, for how long in a row, how many of them right, and the first pose.
+    """Return what the gate did: how many poses it dropped, how long in a row, how many right ones; and the first pose.
 
     Args:
-        off_m: by arrival number, error of the pose (`_off_m`).
+        ledger: of the sightings. off_m: by arrival number, error of the pose (`_off_m`).
     """
     tried = [row for row in ledger if row.seq in off_m]
     dropped = [row for row in tried if row.outcome is Outcome.REJECTED]
@@ -132,12 +137,13 @@ def _why(ledger: Ledger, off_m: Mapping[int, float]) -> str:
 def single_tag_pose(m: TagSighting, tag: tuple[str, int]) -> tuple[Array, Array] | None:
     """Return p_world_camera (3,) m and R_world_camera (3, 3) by one tag alone: the better of its two poses.
 
-    Infinitesimal plane-based pose estimation gives both; Levenberg-Marquardt brings each to its minimum of the reprojection error,
-    with equal weights of all corners. The tag's frame is taken at rest. None if the solver finds none, as for corners on a line.
+    Infinitesimal plane-based pose estimation gives two poses; Levenberg-Marquardt brings each to its minimum of the
+    reprojection error, all corners weighing the same. The tag's dock is taken at rest. None if the solver finds no
+    pose, as for corners on a line.
     """
     first = 4 * m.tags.index(tag)
     corners, pixels = m.points_m[first : first + 4], m.rays[first : first + 4] * _FOCAL_PX
-    # x right, y down, z into the print. With z towards the camera some frontal tags, seen without noise, come out wrong.
+    # Axes x right, y down, z into the print. With z towards the camera, some frontal tags without noise come out wrong.
     right, down = corners[1] - corners[0], corners[3] - corners[0]
     axes = np.column_stack([right, down, np.cross(right, down)])
     R_world_tag = axes / np.linalg.norm(axes, axis=0)
@@ -170,7 +176,11 @@ class _State:
 
 
 def _filtered(before: _State, stamp_ns: int, z: Array, R_world_body: Array | None) -> tuple[_State, float]:
-    """Return the state after a sighting, and the NIS of its position z (3,); R_world_body None: it is not used."""
+    """Return the state after a sighting, and the NIS of its position z (3,).
+
+    Args:
+        before: the last state. R_world_body: (3, 3) by the pose; None: the gate has dropped it.
+    """
     F = np.kron(np.eye(3), [[1.0, _DT_S], [0.0, 1.0]])
     x, P = F @ before.x, F @ before.P @ F.T + np.eye(6)
     r, S = z - _H @ x, _H @ P @ _H.T + _R
@@ -201,8 +211,8 @@ class Losses:
     """How a filter lost the vessel.
 
     Attributes:
-        at_end: more than 2 m off, horizontally, throughout the last 5 s.
-        lost_s: time with an error above 2 m.
+        at_end: whether it is more than 2 m off, horizontally, throughout the last 5 s.
+        lost_s: time with a horizontal error above 2 m.
     """
 
     at_end: bool
@@ -213,7 +223,7 @@ def losses(result: FilterResult, truth: Trajectory) -> Losses:
     """Return the losses of a filter against truth, at the truth's stamps that it covers.
 
     Raises:
-        NoCommonTimeError: it covers none.
+        NoCommonTimeError: the filter covers none of the truth's stamps.
     """
     found = errors(result.trajectory, truth)
     stamps, off = found.stamps_ns, found.horizontal_m > LOST_M

@@ -16,10 +16,12 @@ from graphloc.survey import Survey
 from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
 
-BANDS_M = (0, 5, 8, 12, 16, 20, 25)  # of distance; D's figures 4.5 b and 4.6 b, which end at about 25 m
-DNV_M, DNV_WITHIN_M = 0.10, 5.0  # at 95 % in the docking phase (D sec. 2.1.4.1); D meets it within 4.8 m (table 4.13)
-END_S = 5.0  # of the end of a run
-LOST_M = 2.0  # D's gate; horizontally
+BANDS_M = (0, 5, 8, 12, 16, 20, 25)  # limits of bands of distance, as in D's figures 4.5 b and 4.6 b
+# Error that DNV allows at 95 % in the docking phase, and the distance of that phase (D sec. 2.1.4.1). D meets it within
+# 4.8 m (table 4.13).
+DNV_M, DNV_WITHIN_M = 0.10, 5.0
+END_S = 5.0  # length of the end of a run
+LOST_M = 2.0  # horizontal error from which a track is lost: D's gate
 _SIDE_M = 1.0
 
 Stamps = NDArray[np.int64]
@@ -59,7 +61,7 @@ def docking_table(
     sightings_ns: Stamps,
     lever_m: Array | None = None,
 ) -> Table:
-    """Return a table with a row per estimate; None where an estimate does not cover the period of a number.
+    """Return a table with a row per estimate; a number is None where the estimate does not cover its period.
 
     Args:
         estimates: names and tracks of the body. truth: of the body.
@@ -101,12 +103,12 @@ def accurate_within_m(
     sightings_ns: Stamps,
     lever_m: Array | None = None,
 ) -> float | None:
-    """Return the largest distance (m) to the tags within which 95 % of horizontal errors are at most `DNV_M`; None if there is none.
+    """Return the largest distance (m) to the tags within which 95 % of horizontal errors are at most `DNV_M`, or None.
 
     Args:
         estimate, truth: of the body. survey: with at least one tag.
-        sightings_ns: (S,), at least one: only stamps after the first count; those that the estimate does not cover count
-            as errors above the limit.
+        sightings_ns: (S,), at least one: only stamps from the first on count. Stamps that the estimate does not cover
+            count as errors above the limit.
         lever_m: (3,) point in body that distances are measured from; None: the body's origin.
     """
     seen = truth.stamps_ns >= sightings_ns.min()

@@ -22,11 +22,11 @@ LABELS = {
     "mean_mps": "forward speed minus the measured one (not fused), mean, m/s",
     "std_mps": "forward speed minus the measured one (not fused), standard deviation, m/s",
 }
-"""What a number is, in words; docs/outputs.md says it at length."""
+"""Labels of the metrics; docs/outputs.md explains them."""
 
 
 def significant(value: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits, and never as a power of ten: 9231 is 9230."""
+    """Return a number with `digits` significant digits, and never as a power of ten: 9231 is 9230."""
     return np.format_float_positional(float(f"{value:.{digits}g}"), trim="-")
 
 

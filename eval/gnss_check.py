@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Warn of a constant offset between a GNSS receiver and the other position sensors, which the slow error would absorb.
 
-A receiver's slow error d is a first-order Gauss-Markov process with sigma s and time constant T_c. The mean of each axis over
-a run of length T has the variance
+A receiver's slow error d is a first-order Gauss-Markov process with sigma s and time constant T_c. The mean of each
+axis over a run of length T has the variance
 
     sigma_mean^2 = 2 s^2 (T_c / T) (1 - (T_c / T) (1 - exp(-T / T_c)))
 
-so |mean|^2 / sigma_mean^2 over two axes is chi-square with 2 degrees of freedom. An offset beyond its 95 % quantile that
-hardly changes is not multipath: the map, the survey, the datum or a lever arm is wrong. The data do not show which. For height
-the limit is 3 sigmas, since a mix-up of geoid and ellipsoid gives far more.
+so |mean|^2 / sigma_mean^2 over two axes is chi-square with 2 degrees of freedom. An offset beyond the 95 % quantile
+that hardly changes is not multipath: the map, the survey, the datum or a lever arm is wrong; the data do not show
+which. For height the limit is 3 sigmas, since a mix-up of geoid and ellipsoid gives far more.
 """
 
 from __future__ import annotations
@@ -29,18 +29,19 @@ from graphloc.recording import Recording
 from graphloc.time import NS_PER_S, duration_ns
 from graphloc.trajectory import Trajectory
 
-_STEADY = 0.5  # RMS about the mean, as a share of it
+_STEADY = 0.5  # largest RMS about the mean, as a share of the mean, of an offset that hardly changes
 _HEIGHT_SIGMAS = 3.0
-_FAR_OFF = 3.0  # sigmas of the mean, from which no pose beside it is good
-_BLOCK_S, _FEWEST = 10.0, 3  # fewer blocks do not tell what hardly moves
+_FAR_OFF = 3.0  # sigmas of the mean from which no pose with that receiver is called good
+_BLOCK_S, _FEWEST = 10.0, 3  # length of a block; with fewer blocks it is not known whether an offset changes
 _PLACES = ("pose", "aerial", "apriltag", "gnss")
 
 
 class GnssOffset(NamedTuple):
-    """A constant offset of a receiver from the other position sensors; as text, what is said of it.
+    """A constant offset of a receiver from the other position sensors; as text: `said`.
 
     Attributes:
-        said: the line. doubt: why no pose beside it is called good; empty where it may still be chance, or is in height alone.
+        said: a line for users. doubt: why no pose is called good; empty if the offset may be chance or is only
+            vertical.
     """
 
     said: str
@@ -59,7 +60,7 @@ def gnss_offsets(
         track: of the body. datum: origin of world.
         recording: the measurements; only receivers beside another position sensor are checked.
         config: sensors, their slow errors and mounts.
-        antennas_off_m: (3,) m each, by receiver, how far from its mount the track has its antenna, where it estimates that.
+        antennas_off_m: (3,) m, by receiver, how far from its mount the track has the antenna, where it estimates that.
     """
     offsets = list[GnssOffset]()
     measured = {m.sensor for m in recording.measurements if m.seq >= 0}
@@ -88,7 +89,12 @@ def gnss_offsets(
 def _horizontal(
     name: str, off_m: Array, process: SlowErrorConfig, lasts_s: float, others: Sequence[str]
 ) -> Iterator[GnssOffset]:
-    """Yield the offset if a receiver's errors (N, 2), m, of a run of `lasts_s` are more than its slow error explains."""
+    """Yield the horizontal offset, if the receiver's slow error does not explain it.
+
+    Args:
+        name: of the receiver. off_m: (N, 2) its errors. process: its slow error. lasts_s: length of the run.
+        others: the other position sensors.
+    """
     size, mean = _steady(off_m)
     variance = _mean_variance(process.horizontal_sigma_m, process.time_constant_s, lasts_s)
     if size**2 >= chi2_95(2) * variance:
@@ -104,7 +110,11 @@ def _horizontal(
 def _vertical(
     name: str, off_m: Array, process: SlowErrorConfig, lasts_s: float, others: Sequence[str]
 ) -> Iterator[GnssOffset]:
-    """Yield the same of its errors (N, 1) in height; `others`: what else tells the height."""
+    """Yield the vertical offset, if the slow error does not explain it.
+
+    Args:
+        name, process, lasts_s: as of `_horizontal`. off_m: (N, 1) errors in height. others: what else tells the height.
+    """
     size, mean = _steady(off_m)
     variance = _mean_variance(process.vertical_sigma_m, process.time_constant_s, lasts_s)
     if others and size**2 >= _HEIGHT_SIGMAS**2 * variance:
@@ -117,7 +127,7 @@ def _vertical(
 
 
 def _steady(off_m: Array) -> tuple[float, Array]:
-    """Return the length of the mean of blocks (N, k), m, or 0 where they scatter about it, and the mean itself (k,)."""
+    """Return the length of the mean of blocks (N, k), m, and the mean (k,); length 0 if they scatter too much."""
     mean = off_m.mean(axis=0)
     size = float(np.linalg.norm(mean))
     moves = float(np.sqrt(((off_m - mean) ** 2).sum(axis=1).mean()))

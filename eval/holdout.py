@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hold GNSS fixes out of a run to measure its accuracy: every n-th fix, or gaps of some seconds, as if there were no GNSS."""
+"""Hold GNSS fixes out of a run, to measure its accuracy at them: every n-th fix, or all fixes of some gaps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ _MOST_GAPS, _GAP_S, _FEWEST_FIXES = 8, 10, 10
 
 
 def suggested(fixes: Sequence[GnssPosition]) -> str | None:
-    """Return what --hold-out tests a run of these fixes by: gaps with as much between them; None of too few fixes for either form."""
+    """Return the value of --hold-out that suits a run with these fixes; None: there are too few.
+
+    It is gaps that are as far apart as they are long or, in a short run, every fifth fix.
+    """
     if len(fixes) < _FEWEST_FIXES:
         return None
     gaps = int(((fixes[-1].stamp_ns - fixes[0].stamp_ns) * 1e-9 / _GAP_S - 1.0) / 2.0)
@@ -27,11 +30,12 @@ def suggested(fixes: Sequence[GnssPosition]) -> str | None:
 
 
 def telling(held: Sequence[GnssPosition], config: VesselConfig) -> tuple[GnssPosition, ...]:
-    """Return the held-out fixes that a track is measured by: of a receiver whose RTK comes and goes those of RTK, where there are some.
+    """Return the held-out fixes that a track is measured at; where RTK comes and goes, only those with RTK.
 
-    The others are off by metres themselves, which would be all that is seen.
+    If none of them has RTK, all of the receiver's count. Beside RTK fixes, the errors of the other fixes, of metres,
+    would be all that is measured.
     """
-    # Fixes may also be of a kind that is not in the package, or of a sensor that is not in the configuration.
+    # A fix may be of a sensor that is not in the configuration, or whose kind another package adds.
     turns = {m.sensor for m in held if m.sensor in config.sensors and config.sensors[m.sensor].takes_turns}
     rtk = {name for name in turns if config.sensors[name].fixes == "rtk"}
     worse = {name for name in turns - rtk if rtk.intersection(config.by_turns(name))}
@@ -42,7 +46,7 @@ def telling(held: Sequence[GnssPosition], config: VesselConfig) -> tuple[GnssPos
 class HoldOut:
     """Every `every`-th fix, or `gaps` gaps of `gap_s` seconds each, spread evenly over the span of the fixes.
 
-    A gap is an outage of GNSS, as in a drill: its velocities are held out as well, and what other devices measure is not.
+    A gap is an outage of GNSS, as in a drill: its velocities are held out, too; measurements of other devices are not.
     """
 
     every: int = 0
@@ -64,7 +68,9 @@ class HoldOut:
         raise ConfigError(f"--hold-out {text}: use every:N (N of 2 or more) or gaps:COUNTxSECONDS, e.g. gaps:8x10")
 
     def split(self, recording: Recording) -> tuple[Recording, tuple[GnssPosition, ...]]:
-        """Return the recording without what is held out, which keeps a row in its ledger, and the held-out fixes.
+        """Return the recording without the held-out measurements, and the held-out fixes.
+
+        Each held-out measurement keeps a row in the recording's ledger.
 
         Raises:
             ConfigError: there are too few fixes, or the gaps would overlap.
@@ -78,7 +84,7 @@ class HoldOut:
                 f"{recording.source}: --hold-out gaps:{self.gaps}x{self.gap_s:g}: the gaps do not fit into the "
                 f"{span:.1f} s from the first fix to the last; ask for fewer or shorter ones"
             )
-        # Counted for each receiver: every 2nd of two in turn would be all of one.
+        # Counted for each receiver: of two receivers that alternate, every second fix would be all of one.
         number: defaultdict[str, count[int]] = defaultdict(count)
         held = tuple(m for m in fixes if self._holds(next(number[m.sensor]), m, fixes))
         if not held:

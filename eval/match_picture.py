@@ -15,7 +15,7 @@ from graphloc.frames import Array
 from graphloc.frontends.aerial import Match
 from graphloc.frontends.aerial.image import Pixels
 
-_SIDE, _LEAST_M = 1440, 60.0  # pixels; to each side of the vessel, and farther where what was matched is
+_SIDE, _LEAST_M = 1440, 60.0  # side, px; what is shown to each side of the vessel, or more if the scan reaches farther
 _FACES, _SHORES, _PRIOR = (60, 60, 255), (80, 255, 80), (255, 160, 0)  # blue, green, red
 _LINES = (200, 160, 90)
 _SAID = {
@@ -127,7 +127,7 @@ def drawn(match: Match) -> Pixels:
 
 
 def _image(match: Match, pose: Array) -> tuple[Pixels, _View]:
-    """Return the enlarged image around a pose and what was matched, and where it is."""
+    """Return the enlarged image around a pose and the scan, and the view that it shows."""
     assert match.layers is not None
     patch = match.layers.patch
     places_m = np.vstack([match.found.faces_m, match.found.shore_m])

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy of an estimate: errors (BL eq. 2.29-2.32), percentiles, NEES, coverage; against truth, held-out fixes or speed.
+"""Accuracy of an estimate against truth, held-out fixes or speed: errors, percentiles, NEES, coverage.
 
-The estimate is interpolated at the stamps of the truth and not aligned to it. The matched share is always reported, so that
-a track that covers half of a run does not look better for it.
+Errors are those of BL eq. 2.29-2.32.
+
+The estimate is interpolated at the stamps of the truth, and not aligned to the truth. The share of stamps that it
+covers (`matched`) is always reported, so that a track that covers half of a run does not look better for it.
 """
 
 from __future__ import annotations
@@ -57,8 +59,9 @@ class Table:
 class TruthMetrics:
     """Errors against truth: horizontal position (BL eq. 2.29, 2.30) and heading (eq. 2.31, 2.32).
 
-    `nees` is of the horizontal position: 2.0 (degrees of freedom) where the covariance is honest. `coverage_95` is the share of
-    stamps at which the 95 % region holds the truth. None without a covariance.
+    `nees` is of the horizontal position: 2.0, its degrees of freedom, if the covariance is honest. `coverage_95` is the
+    share of stamps at which the 95 % region holds the truth. They are None without a covariance. `matched` is the share
+    of the truth's stamps that the estimate covers.
     """
 
     position_rmse_m: float
@@ -76,10 +79,10 @@ class TruthMetrics:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PositionErrors:
-    """Errors of an estimate where it covers what it is compared with.
+    """Errors of an estimate at the stamps of its reference that it covers.
 
     Attributes:
-        stamps_ns: (M,). position_m: (M, 3), world. covered: share of all stamps that these are.
+        stamps_ns: (M,). position_m: (M, 3), world. covered: share of the reference's stamps that the M are.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -97,7 +100,7 @@ class TrackErrors(PositionErrors):
     """Errors against a track.
 
     Attributes:
-        heading_rad: (M,). estimate: interpolated at the stamps.
+        heading_rad: (M,) error of the heading. estimate: the estimate, interpolated at the stamps.
     """
 
     heading_rad: Array
@@ -105,10 +108,10 @@ class TrackErrors(PositionErrors):
 
 
 def common_stamps(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.int64], float]:
-    """Return the stamps (N,) of the truth that an estimate covers, and which share of all they are.
+    """Return the stamps (N,) of the truth that an estimate covers, and their share of all.
 
     Raises:
-        NoCommonTimeError: it covers none of them.
+        NoCommonTimeError: the estimate covers none.
     """
     covered = estimate.covers(truth.stamps_ns)
     if not covered.any():
@@ -120,7 +123,7 @@ def errors(estimate: Trajectory, truth: Trajectory) -> TrackErrors:
     """Return the errors of an estimate at the stamps of the truth that it covers.
 
     Raises:
-        NoCommonTimeError: it covers none of them.
+        NoCommonTimeError: the estimate covers none.
     """
     stamps, covered = common_stamps(estimate, truth)
     there, true = estimate.at(stamps), truth.at(stamps)
@@ -147,7 +150,7 @@ def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
     """Return the errors of an estimate against truth.
 
     Raises:
-        NoCommonTimeError: it covers no stamp of the truth.
+        NoCommonTimeError: the estimate covers no stamp of the truth.
     """
     off = errors(estimate, truth)
     error, heading, there, horizontal = off.position_m, off.heading_rad, off.estimate, off.horizontal_m
@@ -175,8 +178,9 @@ def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
 class HeldOutMetrics:
     """Errors of the predicted antenna position against held-out fixes.
 
-    `outage_drift_m`: RMS over the gaps of the largest error in each; None if the fixes do not form several gaps.
-    `fix_rmse_m`: horizontal RMSE of the fixes as they are predicted, with the receiver's slow error; None: the estimate has none.
+    `outage_drift_m` is the RMS, over the gaps, of the largest error in each; None if the fixes do not form several
+    gaps. `fix_rmse_m` is the horizontal RMSE of the fixes as predicted with the receiver's slow error; None if that is
+    not estimated. `fixes` is their number, `matched` the share that the estimate covers.
     """
 
     horizontal_rmse_m: float
@@ -194,16 +198,16 @@ class FixErrors(PositionErrors):
     """Errors of a receiver's antenna at its fixes.
 
     Attributes:
-        fixes: the M that the estimate covers.
+        fixes: the M fixes that the estimate covers.
     """
 
     fixes: Sequence[GnssPosition]
 
     def predicted(self, slow: Mapping[str, SlowEstimate]) -> PositionErrors:
-        """Return the errors of the fixes as they are predicted, with the slow error of their receiver, where the estimate has found it."""
+        """Return the errors of the fixes as predicted with the receivers' slow errors, where `slow` has them."""
         off_m, sensor = self.position_m.copy(), np.array([m.sensor for m in self.fixes])
         for name, error in slow.items():
-            if not (own := sensor == name).any():  # another kind of sensor, whose slow state has other axes
+            if not (own := sensor == name).any():  # of another kind of sensor, whose slow error has other axes
                 continue
             off_m[own] += interpolated(self.stamps_ns[own], error.stamps_ns, error.value[:, :3])
         return PositionErrors(stamps_ns=self.stamps_ns, position_m=off_m, covered=self.covered)
@@ -215,14 +219,14 @@ class Antennas:
 
     Attributes:
         configured: (3,) m each, by the configuration or tf.
-        off_m: (3,) m each, how far from there an estimate has them; by its name, where it estimates that.
+        off_m: by name of an estimate that estimates them: (3,) m each, from the configured place to the estimated one.
     """
 
     configured: Levers
     off_m: Mapping[str, Levers] = field(default_factory=dict)
 
     def of(self, estimate: str) -> Levers:
-        """Return them as an estimate has them, (3,) m each."""
+        """Return the antennas as an estimate has them, (3,) m each."""
         off_m = self.off_m.get(estimate, {})
         return {name: lever_m + off_m.get(name, np.zeros(3)) for name, lever_m in self.configured.items()}
 
@@ -250,7 +254,7 @@ def held_out_errors(estimate: Trajectory, held: Sequence[GnssPosition], datum: D
 def receiver_errors(
     track: Trajectory, fixes: Sequence[GnssPosition], datum: Datum, levers_m: Levers
 ) -> PositionErrors | None:
-    """Return how far a track is off a receiver, at its fixes, as `held_out_errors`; None where it covers none of them."""
+    """Return the errors of a track at the fixes of receivers, as `held_out_errors`; None if it covers none of them."""
     return held_out_errors(track, fixes, datum, levers_m) if track.covers(stamps_of(fixes)).any() else None
 
 
@@ -264,7 +268,8 @@ def compare_to_held_out(
     """Return the errors of an estimate against held-out fixes.
 
     Args:
-        levers_m: antenna of each receiver in body, (3,) m. slow: the slow errors that the estimate has found, if any.
+        estimate, held, datum: as of `held_out_errors`. levers_m: antenna of each receiver in body, (3,) m.
+        slow: slow errors that the estimate has found, by sensor; None: none.
 
     Raises:
         NoCommonTimeError: the estimate covers none of the fixes.
@@ -291,7 +296,7 @@ def compare_to_held_out(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpeedMetrics:
-    """Forward speed of the estimate minus that of a sensor that was not fused."""
+    """Forward speed of the estimate less that of a sensor that was not fused: mean, standard deviation, number."""
 
     mean_mps: float
     std_mps: float
@@ -338,7 +343,11 @@ def held_out_table(
     antennas: Antennas,
     slow: Mapping[str, Mapping[str, SlowEstimate]],
 ) -> Table:
-    """Return a table with a row per estimate, against held-out fixes; `slow` of each as for `compare_to_held_out`."""
+    """Return a table with a row per estimate, against held-out fixes.
+
+    Args:
+        slow: by name of the estimate, its slow errors as for `compare_to_held_out`.
+    """
     rows = [(name, compare_to_held_out(t, held, datum, antennas.of(name), slow.get(name))) for name, t in estimates]
     return _table(
         "Against held-out fixes", rows, "the fixes' own noise is part of the error; gaps lack GNSS velocities, too"
@@ -346,7 +355,11 @@ def held_out_table(
 
 
 def speed_table(estimates: _Named, check: SpeedSeries, switched_off: str = "") -> Table:
-    """Return a table with a row per estimate, against an independent forward speed; `switched_off`: the sensor that would fuse it."""
+    """Return a table with a row per estimate, against an independent forward speed.
+
+    Args:
+        check: the speed. switched_off: name of the sensor that would have fused it, for the note; empty: there is none.
+    """
     rows = [(name, compare_speed(t, check)) for name, t in estimates if t.v_world_mps is not None]
     would = (
         f"; to bridge outages by it set sensors.{switched_off}.enabled in place of check_speed_topic"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Warn of a solved track on which the vessel moves sideways or lies on its side: a sign of a wrong IMU mount.
 
-Measurements can agree with such a track. Body is any frame fixed to the vessel, so an IMU mount that is turned by 90 deg turns body
-with it, and where GNSS positions are the only other measurements, nothing contradicts that.
+Measurements can agree with such a track: if an IMU mount is turned by 90 deg, so is the estimated body, and where GNSS
+positions are the only other measurements, nothing contradicts that.
 """
 
 from __future__ import annotations
@@ -18,18 +18,19 @@ from graphloc.frames import rpy_from_rotation, wrap_angle
 from graphloc.recording import Recording
 from graphloc.trajectory import Trajectory, bounds_95
 
-_MOVES_MPS = 1.0  # below, a vessel may well drift sideways
-_CREEPS_MPS = 0.3  # a robot
-# Least spread of the headings; that of the angle between course and heading over it: 1 where a current sets the craft.
+_MOVES_MPS = 1.0  # speed below which a vessel may well drift sideways
+_CREEPS_MPS = 0.3  # the same for a craft that never goes as fast, as a robot
+# Least spread of the headings; and largest spread of the angle between course and heading over that, which is 1 if a
+# current sets the craft.
 _TURNS, _STEADIER = 0.02, 0.25
-_WAY_M, _MOST = 30.0, 0.6  # least way to judge by; share of it
+_WAY_M, _MOST = 30.0, 0.6  # least distance to judge by; share of it over which course and heading must differ
 _SIDEWAYS_DEG, _TILTED_DEG = 45.0, 45.0
-_KNOWN_DEG = 20.0  # 95 % bound of a heading that is claimed to be known
-_STEADY = 0.8  # length of the mean direction: 1 where the angle is the same all the way
+_KNOWN_DEG = 20.0  # 95 % bound of a heading up to which it counts as known
+_STEADY = 0.8  # length of the mean direction of the angle, from which it is steady; 1 if it is the same all the way
 
 
 class MountDoubt(NamedTuple):
-    """What is odd about a solved track, and what to do about it; as text, both."""
+    """What is odd about a solved track (`seen`), and what to do about it (`cure`); as text: the two together."""
 
     seen: str
     cure: str
@@ -82,7 +83,7 @@ def _sideways(track: Trajectory, recording: Recording, config: VesselConfig) -> 
     mean = complex((way_m * np.exp(1j * off)).sum() / way_m.sum())
     turns = 1.0 - abs(complex((way_m * np.exp(1j * track.yaw_rad[judged])).sum() / way_m.sum()))
     if not fast and (abs(mean) < _STEADY or turns < _TURNS or 1.0 - abs(mean) > _STEADIER * turns):
-        return None  # a current is steady in the world, a wrong mount in the craft
+        return None  # by a current, the drift has a constant direction in world; by a wrong mount, in body
     if abs(mean) < _STEADY or recording.imu is None or recording.imu.sensor not in config.sensors:
         wrong = (
             "the heading is wrong: check the IMU's axes (mount, signs of its rates and accelerations) and the compasses"

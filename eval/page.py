@@ -18,7 +18,7 @@ from graphloc.plain import aligned
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
-    """A cell of a table: its text, and '' or a highlight ('bad' or 'doubt')."""
+    """A cell of a table: its text, and a highlight: 'bad', 'doubt', or '' for none."""
 
     text: str
     mark: str = ""
@@ -26,7 +26,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grid:
-    """A table of text: title, head, rows of cells (as long as the head), and a note below."""
+    """A table of text: title, names of columns, rows of as many cells, and a note below."""
 
     title: str
     head: tuple[str, ...]
@@ -69,7 +69,7 @@ def write_page(path: Path, title: str, said: Sequence[str], parts: Sequence[str]
     """Write a self-contained page.
 
     Args:
-        said: sentences that summarise it, the main one first. parts: HTML.
+        title: of the page. said: sentences of the summary, the main one first. parts: HTML of the rest.
     """
     lead = "".join(f'<p class="{"note" if k else "lead"}">{escape(line)}</p>' for k, line in enumerate(said))
     body = "\n".join([f"<h1>{escape(title)}</h1>{lead}", *parts])

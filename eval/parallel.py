@@ -25,7 +25,8 @@ def run_jobs(
     If a job raises, or the caller stops, jobs that have not begun are not run.
 
     Args:
-        work: function of a module, since it is pickled. workers: number of processes; 1: in this one.
+        work: function at the top level of a module, since it is pickled. jobs: its arguments.
+        workers: number of processes; 1: this one. stage: name of the work, for `progress`.
 
     Raises:
         SolveError: a process died.
@@ -36,7 +37,7 @@ def run_jobs(
             yield number, work(job)
             progress(stage, number + 1, len(jobs))
         return
-    # A forked copy of a process in which the solver's threads have run may hang.
+    # Processes are not forked: a copy of one in which the solver's threads have run may hang.
     spawn, count = multiprocessing.get_context("spawn"), min(workers, len(jobs))
     pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_end_on_interrupt)
     try:

@@ -34,14 +34,14 @@ from graphloc.survey import Survey
 from graphloc.trajectory import Trajectory, bounds_95
 
 TIMELINE = "stamp"
-_POSES = 4000  # of a track: more cannot be seen
-_POINTS = 2000  # of a turn of the LiDARs
-_TEXELS = 1024  # of the image, each way
-_AROUND_M = 60.0  # that is shown about the track
+_POSES = 4000  # most poses of a track: more cannot be seen
+_POINTS = 2000  # most points of a turn of the LiDARs
+_TEXELS = 1024  # most pixels of the image, each way
+_AROUND_M = 60.0  # margin of the image around the track
 _LEVELS = {Health.GOOD: "INFO", Health.DEGRADED: "WARN", Health.DEAD_RECKONING: "WARN", Health.LOST: "ERROR"}
-_TRUTH = "#F0E442"  # black, as in the report, is not seen on water
-_BELOW_M = 1.0  # the water, so that waves and tide leave the tracks above the image
-_BOW = np.array([[[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]]])  # where no hull is known, m in body
+_TRUTH = "#F0E442"  # not black as in the report, which cannot be seen on water
+_BELOW_M = 1.0  # depth of the image below the water, so that waves and tide leave the tracks above it
+_BOW = np.array([[[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]]])  # drawn if no hull is known: a line ahead, m in body
 
 
 def write_rerun(
@@ -54,15 +54,15 @@ def write_rerun(
     bags: Bags = (),
     folder: Path = Path(),
 ) -> None:
-    """Write `path` (.rrd).
+    """Write a run as `path` (.rrd).
 
     Args:
-        solution: of the recording. filters: other estimates of it.
+        solution: of the recording. filters: other estimates of the recording.
         bags: source of scans; empty: no scans. folder: base of relative paths of images.
 
     Raises:
         ExtraError: rerun is not installed. OutputError: the file cannot be written.
-        InputError: an image or a bag that can no longer be read.
+        InputError: an image or a bag can no longer be read.
     """
     rr = need("rerun", "rerun")
     half_written = path.with_name(f".{path.name}.part")
@@ -118,7 +118,7 @@ def _blueprint() -> Any:
 
 
 def _pixels(size: float) -> Any:
-    """Return a radius that is visible from any distance."""
+    """Return a radius of some pixels on the screen, which is visible from any distance."""
     return need("rerun", "rerun").Radius.ui_points(size)
 
 
@@ -134,7 +134,7 @@ def _columns(stream: Any, entity: str, stamps_ns: Any, columns: Any) -> None:
 
 
 def _log_track(stream: Any, name: str, track: Trajectory, colour: str, config: VesselConfig) -> None:
-    """Log the whole path, and the body that moves along it."""
+    """Log the whole path of a track, and the body that moves along it."""
     rr = need("rerun", "rerun")
     entity, thin = f"world/{_entity(name)}", slice(None, None, -(-len(track) // _POSES))
     rgb = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
@@ -163,7 +163,7 @@ def _log_health(stream: Any, solution: Solution) -> None:
 
 
 def _log_measurements(stream: Any, recording: Recording, solution: Solution) -> None:
-    """Log the weight of each measurement, and the position that it gives for body (of a fix: its antenna), red if rejected."""
+    """Log the weight of each measurement, and the position that it gives (for body or the antenna), red if rejected."""
     rr = need("rerun", "rerun")
     rows = {row.seq: row for row in solution.ledger if row.weight is not None and row.seq >= 0}
     by_sensor: dict[str, list[tuple[Measurement, LedgerRow]]] = {}
@@ -199,7 +199,7 @@ def _said_m(m: Measurement, row: LedgerRow, datum: Datum, height_m: float) -> Ar
 
 
 def _log_tags(stream: Any, config: VesselConfig) -> None:
-    """Log the surveyed tags; those of a floating dock at rest."""
+    """Log the surveyed tags, floating docks at rest."""
     rr = need("rerun", "rerun")
     for name, sensor in config.of_kind("apriltag").items():
         survey = sensor.surveyed

@@ -19,9 +19,9 @@ from graphloc.eval.formatting import LABELS, number
 from graphloc.folders import fresh_folder
 from graphloc.outputs import MARK
 
-SUMMARY = "summary.csv"  # a folder with this file is ours to replace
-_MOST_BYTES = 50_000_000  # of a run.json; of twelve hours it is some kB
-# What is shown of each table; summary.csv has every number. Of other tables the first four.
+SUMMARY = "summary.csv"  # a folder with this file was written here, and may be replaced
+_MOST_BYTES = 50_000_000  # largest run.json that is read; that of twelve hours has some kB
+# Numbers that are shown of each table; of other tables the first four. summary.csv has all.
 _SHOWN = {
     "Against truth": ("position_rmse_m", "position_max_m", "heading_rmse_deg", "coverage_95"),
     "Against held-out fixes": ("horizontal_rmse_m", "horizontal_max_m", "outage_drift_m"),
@@ -38,7 +38,7 @@ class FinishedRun:
     """Content of a run folder.
 
     Attributes:
-        name: shortest unique path of the folder. tables: title -> estimate -> number -> value.
+        name: shortest unique path of the folder. folder: its path. tables: title -> estimate -> number -> value.
         warnings: of the run. converged: whether the solver did.
     """
 
@@ -51,7 +51,7 @@ class FinishedRun:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MetricTable:
-    """One number of all runs: a row per run, a column per estimate; then mean and worst."""
+    """One number (`metric`) of all runs: a row per run, a column per estimate; then mean and worst."""
 
     title: str
     metric: str
@@ -123,7 +123,7 @@ def metric_tables(runs: Sequence[FinishedRun], *, shown_only: bool = True) -> li
 
 
 def _metric_table(title: str, metric: str, having: Sequence[FinishedRun]) -> MetricTable:
-    """Return one number of the table of that title, of the runs that have it."""
+    """Return the table of one number over runs; `having`: the runs whose tables of that title have the number."""
     estimates = tuple(dict.fromkeys(e for run in having for e in run.tables[title]))
     rows = tuple((run.name, tuple(run.tables[title].get(e, {}).get(metric) for e in estimates)) for run in having)
     columns = [[v for v in column if v is not None] for column in zip(*(v for _, v in rows), strict=True)]
@@ -162,7 +162,7 @@ def write_summary(folder: Path, runs: Sequence[FinishedRun], *, overwrite: bool)
 
 
 def _csv_rows(runs: Sequence[FinishedRun]) -> Iterator[tuple[str, ...]]:
-    """Return every number of every run; mean and worst as two more runs, with names that no folder has."""
+    """Yield the rows of summary.csv: all numbers of all runs; mean and worst as runs whose names no folder has."""
     for table in metric_tables(runs, shown_only=False):
         for run, values in (*table.rows, ("(mean)", table.mean), ("(worst)", table.worst)):
             for estimate, value in zip(table.estimates, values, strict=True):
@@ -174,7 +174,7 @@ def _lines(table: MetricTable) -> list[tuple[str, ...]]:
     """Return the rows of a table as text; the last one has the ratio of each estimate to the first."""
     rows = [*table.rows, ("mean of the runs", table.mean), ("worst of the runs", table.worst)]
     whole = all(v is None or isinstance(v, int) for _, values in table.rows for v in values)
-    digits = 1 if whole else 3  # a mean of counts
+    digits = 1 if whole else 3  # of counts, a mean needs one
     lines = [(name, *(number(v, digits) for v in values)) for name, values in rows]
     if len(table.estimates) > 1 and table.metric.endswith(("_m", "_deg", "std_mps")):
         over = (_over_first([values for _, values in table.rows], k) for k in range(1, len(table.estimates)))
@@ -188,7 +188,7 @@ def _words(metric: str) -> str:
 
 
 def _over_first(rows: Sequence[Sequence[float | None]], k: int) -> float | None:
-    """Return the mean of column k over that of the first one, over the runs that have both."""
+    """Return the ratio of the means of column k and of the first column, over the runs that have both values."""
     both = [(a, b) for row in rows if (a := row[0]) is not None and (b := row[k]) is not None]
     mine = sum(a for a, _ in both)
     return sum(b for _, b in both) / mine if mine else None
@@ -211,7 +211,7 @@ def _title(runs: Sequence[FinishedRun]) -> str:
 
 
 def _remarks(runs: Sequence[FinishedRun]) -> list[str]:
-    """Return what there is to say of runs, each line once, with the runs that it is of: most warnings of a vessel come with every run."""
+    """Return remarks on runs, each once with the names of its runs: most warnings of a vessel come with every run."""
     of: dict[str, list[str]] = {}
     for run in runs:
         unsettled, alone = not run.converged, not run.tables

@@ -16,7 +16,7 @@ from graphloc.solution import Health, Solution
 Row = Mapping[str, Any]
 
 _PREFIX = {"Against truth": "", "Against held-out fixes": "held_out_", "Forward speed": "speed_"}
-# What the summary shows: column, title, digits, and which end is the worst.
+# Columns of the summary: name, title, digits, and which end is the worst.
 _SHOWN = (
     ("position_rmse_m", "position RMSE, m", 3, max),
     ("position_max_m", "largest error, m", 2, max),
@@ -26,14 +26,14 @@ _SHOWN = (
     ("held_out_horizontal_max_m", "held-out fixes, largest, m", 2, max),
     ("speed_std_mps", "forward speed, std, m/s", 3, max),
 )
-_FAILURES = 20  # that the summary names
+_FAILURES = 20  # most failed runs that the summary names
 
 
 def rows_of(solution: Solution, tables: Sequence[Table], warnings: int) -> list[dict[str, Any]]:
-    """Return a row per estimate, its numbers as columns; statistics of the solver are in the row of the solution.
+    """Return a row per estimate, with its numbers as columns; the row of the solution also has the solver's statistics.
 
     Args:
-        tables: of the run, with a row per estimate. warnings: number of them, without the solver's own.
+        solution: of the run. tables: of the run, with a row per estimate. warnings: their number, without the solver's.
     """
     found: dict[str, dict[str, Any]] = {}
     for table in tables:
@@ -69,7 +69,7 @@ def write(table: Sequence[Row], folder: Path) -> None:
 
 
 def _column(values: list[Any]) -> list[Any]:
-    """Return a column as numbers if all are numbers: parameters come as text."""
+    """Return a column as numbers if all of its values are such: parameters come as text."""
     try:
         return [float(v) if isinstance(v, str) else v for v in values]
     except ValueError:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the survey of tags, and the mounts and clocks of cameras, by a solved run.
 
-It finds tags at another position, those that face another way, wrong sizes, and late images.
+It finds tags that stand elsewhere or face another way, wrong sizes, turned mounts, and late images.
 """
 
 from __future__ import annotations
@@ -26,24 +26,28 @@ from graphloc.time import stamps_of
 
 _FEWEST = 8
 _DOUBTED = 0.5  # share of a tag's sightings that disagree with the rest
-_OFF, _ALIKE = 0.04, 0.05  # a ratio of distances that is off by more, and does not scatter by as much, is a size
+_OFF, _ALIKE = 0.04, 0.05  # a ratio of distances means a wrong size if it is off by more, and scatters by less
 _ELSEWHERE_M = 0.3
-_RANGES = 1.3  # of the farthest to the nearest view, from which on a size shows as one
+_RANGES = 1.3  # ratio of the farthest to the nearest view, from which a wrong size can be told from a wrong position
 _MARGIN = "the black square without its white margin"
-# A stamp that is off by more is said; the share of a camera's errors of roll that it must explain.
+# Least delay that is reported; share of the variance of a camera's roll errors that it must explain.
 _LATE_S, _LATE_EXPLAINS = 0.03, 0.3
-# A mount that tags contradict by more, and by the same all the while, is a wrong one.
+# Least angle by which a mount is wrong; largest scatter of that angle, as a share of it.
 _TURNED_DEG, _STEADY = 6.0, 0.5
-# All tags of a camera elsewhere together.
-_TOGETHER_M = 5.0
-_UPSIDE_DOWN = 0.7  # cosine of the angle between up and down by a tag
-_FITS = 0.5  # of a tag's side, that corners are off at most where one pose explains several: 0.03, and 1.5 to 5 where they hang so
-_UPRIGHT = 3.0  # rise over way of an offset of heights; the rest, without tags, is metres off sideways
-# Share of the sightings of a tag in which the vessel is behind its plane, by more than a fix is off; and by how much more than the
-# camera's lever arm she may be farther from it than it looks: else it is not the facing that is wrong, but the place.
+_TOGETHER_M = 5.0  # least distance by which all tags of a camera stand elsewhere together
+_UPSIDE_DOWN = 0.7  # cosine between down on the vessel and up by a tag, from which the tag hangs upside down
+# Largest misfit of corners, as a share of a tag's side, if one pose explains several tags: usually 0.03, but 1.5 to 5
+# if tags hang upside down.
+_FITS = 0.5
+# Least ratio of vertical to horizontal of an offset of heights: without its tags, a run is metres off sideways
+_UPRIGHT = 3.0
+# Least share of a tag's sightings in which the vessel is behind its plane; by how much, as fixes are off by less; and
+# how much more than the camera's lever arm the distances by fixes and by the image may differ: else the tag's place is
+# wrong, not its facing.
 _BEHIND, _BEHIND_M, _PLACE_M = 0.5, 3.0, 5.0
-_FACES_DEG = 30.0  # by which a face is turned at least, for an angle of another convention
-# Share of what her distance and that which it looks scatter by in sum, up to which their difference scatters.
+_FACES_DEG = 30.0  # least angle by which a face is turned if the survey's angle follows another convention
+# Two distances go together if their difference scatters by less than this share of the scatter of their sum; and one
+# explanation is better than another if it leaves less than this share of the distance.
 _ALONG = 0.5
 
 Key = tuple[str, tuple[str, int]]  # of a tag: its sensor; its family and id
@@ -64,7 +68,7 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
     if behind:  # then nothing else that tags say can be judged, mounts included
         return behind
     facing = _facing_elsewhere(sightings, rows, config, solution)
-    if facing:  # likewise
+    if facing:  # then nothing else that tags say can be judged
         return facing
     turned = _turned_mounts(sightings, rows, solution)
     if turned:  # then nothing else that tags say can be judged
@@ -90,10 +94,11 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
 
 
 def _upside_down(sightings: list[TagSighting], config: VesselConfig) -> list[str]:
-    """Return a line for each sensor with tags that look upside down: up is below by them, and a vessel hardly heels.
+    """Return a line for each sensor with tags that look upside down, as a vessel hardly heels.
 
-    Those printed from OpenCV hang so. The track tells nothing of that: it may follow the tags. Where several of an image agree, it is
-    the camera that is upside down: tags that hang so have each other on the wrong side, and no pose explains them.
+    Tags printed from OpenCV's pictures hang upside down. The track does not show that, as it may follow the tags. If
+    one pose explains several tags of an image, the camera is upside down instead: tags that each hang upside down are
+    on the wrong side of each other, and no single pose explains them.
     """
     level: dict[Key, list[float]] = defaultdict(list)
     together: dict[tuple[str, str], list[float]] = defaultdict(list)
@@ -114,7 +119,7 @@ def _upside_down(sightings: list[TagSighting], config: VesselConfig) -> list[str
 
 
 def _called(found: Iterable[Key], config: VesselConfig) -> dict[str, list[str]]:
-    """Return what the survey of each sensor calls its tags among these."""
+    """Return, by sensor, the names that its survey gives to some tags."""
     called: dict[str, list[str]] = defaultdict(list)
     for sensor, tag in sorted(found):
         called[sensor].append(config.of_kind("apriltag")[sensor].surveyed.called(*tag))
@@ -122,12 +127,12 @@ def _called(found: Iterable[Key], config: VesselConfig) -> dict[str, list[str]]:
 
 
 def _upright_by_tags(m: TagSighting) -> float:
-    """Return the cosine of the angle between up by a camera's mount, on a level vessel, and up by its tags."""
+    """Return the cosine of the angle between up by a camera's mount, if the vessel is level, and up by its tags."""
     return float(m.R_body_camera[2] @ m.modes[0].R_world_camera[2])
 
 
 def _misfit(m: TagSighting) -> float:
-    """Return by how much of the first tag's side corners are off where the likeliest pose has them, RMS."""
+    """Return how far corners are from where the likeliest pose has them, RMS, as a share of the first tag's side."""
     mode = m.modes[0]
     seen = (m.points_m - mode.p_world_camera_m) @ mode.R_world_camera
     off = np.linalg.norm(seen[:, :2] / seen[:, 2:] - m.rays, axis=1)
@@ -137,9 +142,9 @@ def _misfit(m: TagSighting) -> float:
 def _seen_from_behind(
     sightings: list[TagSighting], recording: Recording, config: VesselConfig, solution: Solution
 ) -> list[str]:
-    """Return a line for each sensor with tags that face away from where the fixes have the vessel when she sees them.
+    """Return a line for each sensor with tags that face away from where the fixes have the vessel.
 
-    The track tells nothing of that: it may follow the tags, to the other side of the quay.
+    The track does not show that: it may follow the tags to the other side of the quay.
     """
     fixes = sorted(recording.of(GnssPosition), key=lambda m: m.stamp_ns)
     if len(fixes) < _FEWEST:
@@ -150,7 +155,7 @@ def _seen_from_behind(
         nearest = int(np.argmin(np.abs(stamps - m.stamp_ns)))
         for tag, corners in zip(m.tags, m.points_m.reshape(-1, 4, 3), strict=True):
             away = places[nearest] - corners.mean(axis=0)[:2]
-            out = np.cross(corners[1] - corners[0], corners[0] - corners[3])[:2]  # right x up
+            out = np.cross(corners[1] - corners[0], corners[0] - corners[3])[:2]  # right x up: out of the printed face
             before_m = float(away @ out) / max(float(np.linalg.norm(out)), 1e-9)
             away_m, looks_m = float(np.linalg.norm(away)), float(np.linalg.norm(_in_camera(m)))
             as_far = abs(away_m - looks_m) < float(np.linalg.norm(m.t_body_camera_m)) + _PLACE_M
@@ -164,12 +169,13 @@ def _seen_from_behind(
 
 
 def _faces_away(seen: Array) -> bool:
-    """Return whether a tag faces away from where it is seen: the farther off it looks, the farther is the vessel, behind its plane.
+    """Return whether a tag faces away from the vessel: she is behind its plane, and as far from it as it looks.
 
-    Behind a tag whose place is wrong, or by fixes that are, she comes nearer to it as it looks farther off.
+    If instead the tag's place or the fixes are wrong, she comes nearer to that place as the tag looks farther away.
 
     Args:
-        seen: (N, 3) how far she is from it, and how far it looks, m; whether she is clearly behind its plane, and about as far.
+        seen: (N, 3) of each sighting: distance by the fixes, m; distance by the image, m; 1 if she is clearly behind
+            the plane while the two distances about agree, else 0.
     """
     behind = seen[:, 2] > 0.0
     if behind.mean() < _BEHIND:
@@ -181,9 +187,10 @@ def _faces_away(seen: Array) -> bool:
 def _facing_elsewhere(
     sightings: list[TagSighting], rows: Mapping[int, LedgerRow], config: VesselConfig, solution: Solution
 ) -> list[str]:
-    """Return a line for each refused tag that stands where the survey says and faces another way, as by an angle of another convention.
+    """Return a line for each disbelieved tag that stands where the survey says, but faces another way.
 
-    A camera's mount that is turned shows the tag elsewhere, too: what puts it nearer to its place is taken for the cause.
+    The survey's angle may follow another convention. A turned camera mount shows a tag elsewhere, too; the cause is the
+    one of the two that puts the tag nearer to its surveyed place.
     """
     if not (doubted := _doubted(sightings, rows)):
         return []
@@ -192,7 +199,11 @@ def _facing_elsewhere(
 
 
 def _faces_turned(sightings: list[TagSighting], solution: Solution, least_deg: float) -> dict[Key, float]:
-    """Return by how much tags are turned about up, deg, at least, where that puts them nearer to their places than a mount would."""
+    """Return by how much tags are turned about up, deg, by tag.
+
+    Only tags that are turned by `least_deg` or more, and are nearer to their surveyed places so than with a turned
+    mount.
+    """
     seen: dict[Key, list[tuple[float, float, float]]] = defaultdict(list)
     for m, p, R in zip(sightings, *solution.trajectory.poses_at(stamps_of(sightings)), strict=True):
         for k, tag in enumerate(m.tags):
@@ -210,10 +221,16 @@ def _faces_turned(sightings: list[TagSighting], solution: Solution, least_deg: f
 
 
 def _turned_about_up(m: TagSighting, k: int, p: Array, R: Array) -> tuple[float, float, float] | None:
-    """Return how the k-th tag of a sighting is turned from how the survey has it, by the run's pose of body p (3,), R (3, 3): about up, deg.
+    """Return how the k-th tag of a sighting is turned from how the survey has it.
 
-    And how far from its place it looks, m, if its facing is the cause, and if the camera's mount is. By itself, as no pose explains
-    several; None where none explains it.
+    Each tag is taken by itself, as no pose may explain several.
+
+    Args:
+        p, R: (3,), (3, 3) pose of body by the run.
+
+    Returns:
+        Turn about up, deg; distance (m) of the tag from its surveyed place if its facing is wrong; the same if the
+        camera's mount is wrong. None: no pose explains the tag.
     """
     camera, looks = p + R @ m.t_body_camera_m, R @ m.R_body_camera
     corners, own = slice(4 * k, 4 * k + 4), slice(8 * k, 8 * k + 8)
@@ -221,7 +238,7 @@ def _turned_about_up(m: TagSighting, k: int, p: Array, R: Array) -> tuple[float,
     if not poses:
         return None
     turns = [Rotation.from_matrix(looks @ pose.R).as_rotvec(degrees=True) for pose in poses]
-    upright = int(np.argmin([np.hypot(*turn[:2]) for turn in turns]))  # a tag that stands upright stays so
+    upright = int(np.argmin([np.hypot(*turn[:2]) for turn in turns]))  # the pose by which the tag stays upright
     pose, middle = poses[upright], m.points_m[corners].mean(axis=0)
     by_facing = camera + looks @ (pose.R @ middle + pose.t_m) - middle
     by_mount = camera + pose.R.T @ pose.t_m
@@ -229,13 +246,13 @@ def _turned_about_up(m: TagSighting, k: int, p: Array, R: Array) -> tuple[float,
 
 
 def _usual(turns: Rotation) -> tuple[Rotation, float]:
-    """Return the mean of rotations (N), and how far from it they are, deg, median."""
+    """Return the mean of N rotations, and the median of their angles to it, deg."""
     usual = turns.mean()
     return usual, float(np.degrees(np.median((usual.inv() * turns).magnitude())))
 
 
 def _faces_elsewhere(key: Key, turn_deg: float, config: VesselConfig) -> str:
-    """Return the line on a tag whose face is seen turned (deg, counter-clockwise) from how the survey has it."""
+    """Return the line on a tag whose face is turned (deg, counter-clockwise) from how the survey has it."""
     sensor, (family, number) = key
     survey = config.of_kind("apriltag")[sensor].surveyed
     (tag,) = (tag for tag in survey.tags if (tag.family, tag.id) == (family, number))
@@ -262,7 +279,7 @@ def _by_image(sightings: list[TagSighting]) -> list[list[TagSighting]]:
 
 
 def _doubted(sightings: list[TagSighting], rows: Mapping[int, LedgerRow]) -> list[TagSighting]:
-    """Return those that the run hardly believes, by their rows of the ledger; none where these are few of all."""
+    """Return the sightings that the run hardly believes, by their ledger rows; none if they are few of all."""
     weights = [None if (row := rows.get(m.seq)) is None else row.weight for m in sightings]
     doubted = [m for m, weight in zip(sightings, weights, strict=True) if weight is not None and weight < 0.5]
     return doubted if len(doubted) >= max(_FEWEST, _DOUBTED * len(sightings)) else []
@@ -279,9 +296,9 @@ def _in_camera(m: TagSighting) -> Array:
 
 
 def _by_spacing(images: list[list[TagSighting]]) -> dict[Key, str]:
-    """Return a line for tags that all have a wrong size, because no two of an image fit together.
+    """Return a line, by tag, for tags that all have a wrong size, as their spacing in images does not fit the survey.
 
-    Their spacing in units of their size is independent of the track, which may be wrong because of them.
+    The spacing in units of the tags' size is independent of the track, which may be wrong because of the tags.
     """
     ratios: dict[Key, list[float]] = defaultdict(list)
     size_m: dict[Key, float] = {}
@@ -305,9 +322,10 @@ def _by_spacing(images: list[list[TagSighting]]) -> dict[Key, str]:
 
 
 def _by_the_others(images: list[list[TagSighting]]) -> dict[Key, str]:
-    """Return a line by tag for each that others in its images, which agree, show at another position.
+    """Return a line, by tag, for each tag that the other tags in its images show at another position, while they agree.
 
-    That is independent of the track: one that follows the wrong tag, with the vessel turned by 13 deg, shows no disagreement.
+    This is independent of the track: a track that follows the wrong tag, with the vessel turned by 13 deg, shows no
+    disagreement.
     """
     shown: dict[Key, list[Array]] = defaultdict(list)
     for own in images:
@@ -350,8 +368,9 @@ def _explained(own: list[TagSighting], p: Array, R: Array) -> str:
 def _scale(camera: Array, toward: Array, middle: Array) -> tuple[float, bool]:
     """Return the ratio of a tag's size to the surveyed one, and whether it is certain.
 
-    A tag at rest satisfies camera + scale toward = position, wherever it is: views from several distances determine the scale,
-    even if the track has a constant error. Views from one distance only do so if the tag is at its surveyed position.
+    A tag at rest satisfies camera + scale toward = position, wherever it is. So views from several distances determine
+    the scale, even if the track has a constant error. Views from a single distance do so only if the tag is at its
+    surveyed position.
     """
     ranges = np.linalg.norm(toward, axis=1)
     if ranges.max() > _RANGES * ranges.min():
@@ -365,7 +384,7 @@ def _scale(camera: Array, toward: Array, middle: Array) -> tuple[float, bool]:
 
 
 def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], solution: Solution) -> list[str]:
-    """Return a line for each camera whose sightings are rejected and agree on another attitude or position on the vessel."""
+    """Return a line for each camera whose rejected sightings agree on another mount, or another place of the vessel."""
     lines = []
     track = solution.trajectory
     for sensor, camera in sorted({(m.sensor, m.camera) for m in sightings}):
@@ -376,13 +395,14 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
         seen = Rotation.from_matrix([B.T @ m.modes[0].R_world_camera for m, B in zip(doubted, R, strict=True)])
         usual, scatter_deg = _usual(seen)
         off_deg = float(np.degrees((usual.inv() * Rotation.from_matrix(doubted[0].R_body_camera)).magnitude()))
-        # With the attitude that they agree on: where all stand elsewhere, the heading without them may be off as well.
+        # With the attitude that the sightings agree on: if all tags stand elsewhere, the run's heading may be off as
+        # well.
         as_seen = [replace(m, R_body_camera=usual.as_matrix()) for m in doubted]
         offs = np.array([_by_tags(m, B) for m, B in zip(as_seen, R, strict=True)]) - p
         moved = np.median(offs, axis=0)
         moved_m = float(np.linalg.norm(moved))
         elsewhere = moved_m > _TOGETHER_M and np.median(np.abs(offs - moved)) < 0.1 * moved_m
-        # No heading that is off rolls or pitches a camera.
+        # A wrong heading neither rolls nor pitches a camera.
         off_rad = (usual * Rotation.from_matrix(doubted[0].R_body_camera).inv()).as_rotvec()
         rolled = np.degrees(np.hypot(*off_rad[:2])) > _TURNED_DEG
         if (rolled or not elsewhere) and off_deg > _TURNED_DEG and scatter_deg < _STEADY * off_deg:
@@ -395,7 +415,7 @@ def _turned_mounts(sightings: list[TagSighting], rows: Mapping[int, LedgerRow], 
 
 
 def _all_elsewhere(sensor: str, camera: str, moved_m: Array) -> str:
-    """Return a line on tags that all put the vessel elsewhere; straight up or down it is the heights of their survey."""
+    """Return a line on tags that all put the vessel elsewhere; if up or down, it suspects the survey's heights."""
     upright = abs(float(moved_m[2])) > _UPRIGHT * float(np.hypot(*moved_m[:2]))
     why = (
         "are the survey's heights above the geoid, or the sea? Those of world are above the ellipsoid, from height_m of `datum`"
@@ -409,14 +429,14 @@ def _all_elsewhere(sensor: str, camera: str, moved_m: Array) -> str:
 
 
 def mount_off(solution: Solution, sensor: str, camera: str) -> Rotation:
-    """Return the estimated error of a camera's mount about the body's axes: `mount_off * mount` is the true one."""
+    """Return the estimated error of a camera's mount, in body axes: `mount_off * mount` is the true mount."""
     slow = solution.slow.get(sensor)
     off_deg = None if slow is None else slow.surest([f"{camera} mount {axis}" for axis in ("roll", "pitch", "yaw")])
     return Rotation.identity() if off_deg is None else Rotation.from_rotvec(off_deg, degrees=True)
 
 
 def _estimated_mounts(sightings: list[TagSighting], solution: Solution) -> Iterator[str]:
-    """Return a line for each camera whose estimated mount is far from the configured one."""
+    """Yield a line for each camera whose estimated mount is far from the configured one."""
     given = {(m.sensor, m.camera): m.R_body_camera for m in sightings}
     for (sensor, camera), R_body_camera in sorted(given.items()):
         off = mount_off(solution, sensor, camera)
@@ -434,7 +454,7 @@ def _looks_elsewhere(sensor: str, camera: str, off_deg: float, mount: Rotation) 
 
 
 def _or_faces(faces: Mapping[Key, float]) -> str:
-    """Return the other explanation for a camera that looks elsewhere: all tags face another way (deg), less than none could be off by."""
+    """Return the other explanation for a turned camera: all tags face another way; `faces`: by how much, deg."""
     turn_deg = float(np.median(list(faces.values())))
     return (
         f"; or, which puts the tags nearer to their places, they all face {abs(turn_deg):.0f} deg further "
@@ -443,16 +463,16 @@ def _or_faces(faces: Mapping[Key, float]) -> str:
 
 
 def _by_tags(m: TagSighting, R_world_body: Array) -> Array:
-    """Return the position (3,) of body by a sighting, with the attitude of the run."""
+    """Return the position (3,) of body in world by a sighting, with the attitude of the run."""
     toward = R_world_body @ m.R_body_camera @ _in_camera(m)
     return np.asarray(m.points_m.mean(axis=0) - toward - R_world_body @ m.t_body_camera_m)
 
 
 def _late(sightings: list[TagSighting], solution: Solution) -> Iterator[str]:
-    """Return a line for each camera whose stamps are late or early, by its roll about the optical axis.
+    """Yield a line for each camera whose stamps are late or early, by its roll about the optical axis.
 
-    Stamps that are late by d come with the attitude of d ago: the camera's roll minus the run's is -d times its rate. Tags
-    determine the roll best: to first order, and with either of two poses.
+    A stamp that is late by d comes with the attitude of d earlier: the roll by the image less that by the run is -d
+    times the rate of roll. Tags determine the roll best: to first order, and equally well with either of two poses.
     """
     track = solution.trajectory
     by_camera: dict[tuple[str, str], list[TagSighting]] = defaultdict(list)

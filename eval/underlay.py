@@ -15,16 +15,16 @@ from graphloc.frames import Array, Datum
 from graphloc.frontends.aerial.image import AerialImage
 
 _SIDE_PX = 1200  # about 400 kB
-_AROUND = 0.12  # of the run's size, and
+_AROUND = 0.12  # margin around the track, as a share of its size; to which `_AROUND_M` is added
 _AROUND_M = 15.0
-_WIDER, _LONGEST = 1.2, 1.8  # the picture's width over its height: so a screen shows it large
+_WIDER, _LONGEST = 1.2, 1.8  # least and largest width over height of the picture, so that a screen shows it large
 _FINEST_M = 0.1
-_LARGEST_M = 20_000.0  # a page shows nothing of what lies beside a track of that length
+_LARGEST_M = 20_000.0  # half the size of the map from which no image is drawn: nothing beside the track could be seen
 _QUALITY = 72
 
 
 def underlay(config: VesselConfig, folder: Path, datum: Datum, p_world_m: Array) -> tuple[Underlay | None, str]:
-    """Return the image around a track; without one, the reason if an image was configured, else ''.
+    """Return the image around a track, or None and the reason; the reason is empty if no image is configured.
 
     Args:
         config: its `output.map_image` is used, or the image of its first aerial sensor.
@@ -53,7 +53,7 @@ def underlay(config: VesselConfig, folder: Path, datum: Datum, p_world_m: Array)
     window = (slice(top, bottom), slice(left, right))
     shown = np.where(patch.inside[..., None], patch.pixels, 255)[window]
     coded = cv2.imencode(".jpg", np.ascontiguousarray(shown[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-    west, north = patch.west_m - 0.5 * cell_m, patch.north_m + 0.5 * cell_m  # of the patch's outer edge
+    west, north = patch.west_m - 0.5 * cell_m, patch.north_m + 0.5 * cell_m  # outer edge of the patch
     return Underlay(
         jpeg=coded.tobytes(), west_m=west + left * cell_m, east_m=west + right * cell_m,
         north_m=north - top * cell_m, south_m=north - bottom * cell_m,

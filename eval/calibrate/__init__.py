@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration suggestions: lever arms, time offsets, mounts and IMU noise that a run contradicts. They are never applied."""
+"""Calibration suggestions: lever arms, time offsets, mounts and IMU noise that a run contradicts; never applied."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ PROBE: Probe = {
     "pose": ("yaw", "time"),
     "aerial": ("yaw", "time"),
 }
-"""What is looked at, by kind of sensor, those first that are wrong most often; heights show too little."""
+"""Offsets that are checked, by kind of sensor, the most often wrong first; a run hardly shows vertical ones."""
 
-_MUCH_LESS = 0.3  # of a delay, that the track may lack
-_DOUBTFUL = 3.0  # sigmas: too few for a suggestion, too many for one that fits
+_MUCH_LESS = 0.3  # share of a delay that the track's own estimate may miss and still count as a correction of it
+_DOUBTFUL = 3.0  # sigmas of an offset: too few for a suggestion, too many to say that the setting fits
 _AXIS: dict[Offset, int] = {"x": 0, "y": 1}
 _UNIT: dict[Offset, tuple[str, float]] = {
     "x": ("m", 1.0),
@@ -38,7 +38,7 @@ _UNIT: dict[Offset, tuple[str, float]] = {
     "yaw": ("deg", 180.0 / np.pi),
     "time": ("s", 1.0),
 }
-# A sigma from which the run says nothing of use, and what would help.
+# Sigma of an offset above which the run says nothing useful of it; the manoeuvre that would tell it.
 _USEFUL: dict[Offset, float] = {"x": 0.15, "y": 0.15, "yaw": float(np.radians(1.0)), "time": 0.05}
 _WOULD_TELL: dict[Offset, str] = {
     "x": "turns by 90 degrees and more, within a minute or so",
@@ -55,11 +55,11 @@ _MEANS: dict[Offset, str] = {
 
 
 def calibrate(recording: Recording, config: VesselConfig, solution: Solution) -> Calibration:
-    """Return what a smoothed run contradicts of its configuration (docs/calibration.md).
+    """Return the settings that a smoothed run contradicts (docs/calibration.md).
 
     Args:
-        recording, config: as smoothed. solution: with `offsets`, as `PROBE` requests them; without, only the noise of the
-            IMU's samples is checked.
+        recording, config: as smoothed. solution: with the `offsets` that `PROBE` requests. If it has none, only the
+            noise of the IMU's samples is checked.
     """
     suggestions, checks = [], []
     if solution.offsets is not None and len(solution.offsets.names):
@@ -85,7 +85,7 @@ def calibrate(recording: Recording, config: VesselConfig, solution: Solution) ->
 
 
 def _configured(name: Name, recording: Recording, config: VesselConfig) -> tuple[str, float]:
-    """Return the key in vessel.yaml and its value, in the unit of the key."""
+    """Return the key in vessel.yaml that an offset corrects, and its value in the unit of the key."""
     sensor, what = name
     block = config.sensors[sensor]
     if what == "time":
@@ -99,9 +99,10 @@ def _configured(name: Name, recording: Recording, config: VesselConfig) -> tuple
 
 
 def _of_one_antenna(sensor: str, recording: Recording, config: VesselConfig) -> list[str]:
-    """Return the sensors of other kinds, and of the same receiver, at the same position: their lever arm is estimated from all of them together.
+    """Return the other sensors whose lever arm is estimated together with that of a sensor, as they have one position.
 
-    Without those whose `antenna` is the sensor's: they sit where that is set.
+    They are of another kind, or of the same receiver. Sensors whose `antenna` is the given one are not listed: they
+    take its position.
     """
     own = config.sensors[sensor]
     place = mount_of(sensor, own, recording.mounts)[0]
@@ -112,15 +113,19 @@ def _of_one_antenna(sensor: str, recording: Recording, config: VesselConfig) -> 
 
 
 def _of_one_clock(sensor: str, config: VesselConfig) -> list[str]:
-    """Return the other sensors that read the same receiver by turns, at the same offset: the delay is estimated from all of them together."""
+    """Return the other sensors whose delay is estimated together with that of a sensor.
+
+    They read the same receiver by turns, and have the same `time_offset_s`.
+    """
     block = config.sensors[sensor]
     return [n for n in config.by_turns(sensor)[1:] if config.sensors[n].time_offset_s == block.time_offset_s]
 
 
 def _imu_at_origin(recording: Recording, config: VesselConfig) -> str:
-    """Return the IMU whose place in the body is 0; empty where it is not. Fixes and an IMU tell how far apart they are, and no more.
+    """Return the name of the IMU, if its position in body is set to 0; else empty.
 
-    That 0 may be a guess of `inspect`, and in a vessel.effective.yaml it may be what /tf_static says.
+    Fixes and an IMU only tell the vector between antenna and IMU, so the IMU may be the one that is elsewhere. The 0
+    may be a guess of `inspect`; in a vessel.effective.yaml it may also come from /tf_static.
     """
     imu = "" if recording.imu is None else recording.imu.sensor
     zero = imu in config.sensors and imu not in recording.mounts and not any(config.sensors[imu].mount.xyz_m)
@@ -135,11 +140,11 @@ def _suggestion(
     config: VesselConfig,
     taken_s: float | None = None,
 ) -> Suggestion:
-    """Return what an offset that the run shows suggests.
+    """Return the suggestion that follows from an offset.
 
     Args:
-        others: offsets that explain the run as well, which it cannot tell from this one.
-        taken_s: what the track has taken of a delay, where it is estimated.
+        name, found: the offset and its estimate. others: offsets that explain the run as well.
+        taken_s: delay that the track itself has estimated; None: it estimates none.
     """
     key, configured = _configured(name, recording, config)
     unit, factor = _UNIT[name[1]]
@@ -180,7 +185,8 @@ def _action(
             "measure it; its mount comes from /tf_static: correct it there, or set xyz_m and rpy_deg without tf_frame"
         )
     if name[1] == "yaw" and recording.imu is not None:
-        # Where fixes and the IMU's accelerations say the heading, the IMU's own yaw in the craft is in it, which is no state.
+        # If fixes and the IMU's accelerations tell the heading, it includes the yaw of the IMU's mount, which is no
+        # state.
         action += f"; or sensors.{recording.imu.sensor}.mount.rpy_deg[2] is off, the other way"
     if name[1] in _AXIS and (imu := _imu_at_origin(recording, config)):
         action += f"; or it is the IMU that sits elsewhere, the other way: measure sensors.{imu}.mount.xyz_m, too, unless the 0 there is measured"

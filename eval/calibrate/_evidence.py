@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which offsets must be wrong, from the dependence of a run's cost on them.
 
-With H, g summed over all blocks, free offsets F are theta = H_FF^-1 g_F, with covariance H_FF^-1 if the noise is as configured.
-The jackknife, leaving out each block of ten seconds in turn, checks that; the larger of the two sigmas counts. Slow GNSS errors
-are in H already, as slow states.
+The cost is quadratic in the offsets, with curvature H and negative gradient g, summed over blocks of ten seconds. If
+the offsets F are free, they are theta = H_FF^-1 g_F, with covariance H_FF^-1 if the noise is as configured. The
+jackknife, which leaves out each block in turn, checks that covariance; the larger of the two sigmas counts. Slow GNSS
+errors are already in H, as slow states.
 
-Offsets are freed one by one, the most significant first, each with those before it. Of two that affect the run alike (a lever
-arm forward and a late stamp, at a steady speed) only one is ever believed, and each is named as the other's alternative.
+Offsets are freed one by one, the most significant first, each together with those before it. Of two that affect the run
+alike (a lever arm forward and a late stamp, at a steady speed) only one is ever believed, and the other is named as its
+alternative.
 """
 
 from __future__ import annotations
@@ -21,11 +23,15 @@ from graphloc.offsets import Offset, Offsets
 
 Name = tuple[str, Offset]
 
-_BLOCK_S = 10.0  # within which residuals go together, as errors last for seconds: each block is one piece of evidence; a choice
-CLEAR = 4.0  # sigmas from which an offset is believed to be wrong: some ten are looked at in each run
+# Length of a block, which counts as one piece of evidence: errors last for seconds, so residuals within one are
+# dependent. A choice.
+_BLOCK_S = 10.0
+CLEAR = 4.0  # sigmas from which an offset is believed to be wrong; so many because each run checks about ten
 LEAST: dict[Offset, float] = {"x": 0.05, "y": 0.05, "yaw": float(np.radians(0.5)), "time": 0.01}
-_AS_WELL, _EXPLAINS = 0.95, 0.8  # shares of the drop of the cost from which another offset explains the run, too
-_UNSEEN = 1e-9  # a curvature below this is rounding
+# Share of the best decrease of the cost from which an offset may be taken for the cause instead, or is named as an
+# alternative.
+_AS_WELL, _EXPLAINS = 0.95, 0.8
+_UNSEEN = 1e-9  # curvature below which it is rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +52,7 @@ class Evidence:
     """Sums of a run in blocks that are long enough to be nearly independent.
 
     Args:
-        order: sorts the offsets, those that are most often wrong first; default: as given.
+        order: sort key of the offsets, the most often wrong first; default: as given.
     """
 
     def __init__(self, offsets: Offsets, order: Callable[[Name], int] = lambda _name: 0) -> None:
@@ -69,7 +75,7 @@ class Evidence:
         theta = np.linalg.solve(total, g.sum(axis=0))
         cov = np.linalg.inv(total)
         sigma = np.sqrt(np.maximum(np.diagonal(cov), _jackknife(g, H)))
-        # What the cost drops by if this one is free, too: theta^2 / its own variance.
+        # Decrease of the cost if this offset is freed, too: theta^2 / its variance.
         return {
             name: OffsetEstimate(float(v), float(s), float(v**2 / c))
             for name, v, s, c in zip(free, theta, sigma, np.diagonal(cov), strict=True)
@@ -84,13 +90,13 @@ class Evidence:
             if not clear:
                 break
             most = clear[max(clear, key=lambda n: abs(clear[n].z))].drop
-            # Of those that explain the run as well, the likeliest to be wrong.
+            # Of the offsets that explain the run equally well, the one that is most often wrong.
             free = (*free, next(name for name in self.names if name in clear and clear[name].drop > _AS_WELL * most))
         found = self.estimates(free)
         return tuple(name for name in free if self._stands(name, found[name]))
 
     def alternatives(self, name: Name, free: tuple[Name, ...]) -> dict[Name, OffsetEstimate]:
-        """Return the offsets that explain the run about as well as `name`, with the others of `free` free."""
+        """Return the offsets that explain the run about as well as `name`, while the others of `free` stay free."""
         rest = tuple(n for n in free if n != name)
         drop = self.estimates((*rest, name))[name].drop
         tried = {n: self.estimates((*rest, n))[n] for n in self.names if n not in free}
@@ -106,7 +112,7 @@ def _solvable(found: dict[Name, OffsetEstimate]) -> bool:
 
 
 def _jackknife(g: Array, H: Array) -> Array:
-    """Return the variances (k,) of the solution by the jackknife over blocks; zero if one block holds all information."""
+    """Return the variances (k,) of the solution by the jackknife over blocks; 0 if one block has all information."""
     n, total, whole = len(g), H.sum(axis=0), g.sum(axis=0)
     if n < 3:
         return np.zeros(g.shape[1])

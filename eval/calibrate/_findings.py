@@ -16,9 +16,9 @@ class Suggestion:
     """A setting that the run contradicts.
 
     Attributes:
-        sensor: its name. key: of the setting in vessel.yaml; unit: of the numbers.
-        configured, suggested: the current value, and the one that fits the run best.
-        sigma: of `suggested`, 1 sigma. z: their difference in sigmas.
+        sensor: its name. key: of the setting in vessel.yaml. unit: of the numbers.
+        configured, suggested: the present value, and the one that fits the run best.
+        sigma: 1 sigma of `suggested`. z: difference of the two values, in sigmas.
         evidence: the reason, in one sentence. action: what to do.
     """
 
@@ -45,7 +45,7 @@ class Check:
 
     Attributes:
         key, unit, configured: as in `Suggestion`. change, sigma: the estimated correction and its 1 sigma.
-        said: what that means, or which manoeuvre would determine it.
+        said: what the correction means, or which manoeuvre would determine it.
     """
 
     key: str
@@ -83,7 +83,7 @@ class Calibration:
 
 
 def _number(value: float, sigma: float = np.inf) -> str:
-    """Return a value to three digits, or to as many as its sigma supports: clocks may differ by years, known to milliseconds."""
+    """Return a value to three digits, or to as many as its sigma supports: an offset of years may be known to ms."""
     digits = 4 if abs(value) >= 1000.0 else 3
     if value and 0.0 < sigma < abs(value):
         digits = max(digits, 2 + int(np.floor(np.log10(abs(value) / sigma))))

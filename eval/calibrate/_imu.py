@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Noise of the IMU: by the scatter of its samples, and by the residuals of the solved run.
 
-Samples show the white noise, with engine and hull: third differences remove motion, and those of white noise have 20 times its
-variance. A configured noise below that is too small. One above it may be intended (slow vibration does not scatter from sample
-to sample), so it is called too large only if the residuals at the IMU in the solved run are smaller, too.
+Samples show the white noise, vibration of engine and hull included: third differences remove the motion, and have 20
+times the variance of white noise. A configured noise below this scatter is too small. A larger one may be intended,
+since slow vibration does not scatter from sample to sample. So it is called too large only if the IMU's residuals in
+the solved run are smaller, too.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from graphloc.measurements import ImuSeries
 from graphloc.offsets import Misfit, Offsets
 from graphloc.signals.imu_scatter import FEWEST, noise_density
 
-_TOO_SMALL, _TOO_LARGE = 1.5, 0.5  # scatter by configured noise
-_LESS = 0.7  # of the configured noise: what the run needs, from which that is too large
+_TOO_SMALL, _TOO_LARGE = 1.5, 0.5  # scatter over configured noise, from which this is too small or too large
+_LESS = 0.7  # noise that the run needs over configured noise, below which this is too large
 _UG, _MDPS = 1e-6 * STANDARD_GRAVITY_MPS2, float(np.radians(1e-3))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Harbour failures, as functions from a recording to a recording. The same seed gives the same failure.
+"""Harbour failures, as functions from a recording to a recording. A seed always gives the same failure.
 
 Each measurement that a failure removes keeps a row in the ledger, as held-out fixes do.
 """
@@ -48,7 +48,7 @@ class Struck:
 
 
 Strike = Callable[[Recording, int, int, np.random.Generator], Struck]
-"""Of a recording, the failure's first stamp (ns), the one after its last, and a generator: what becomes of it."""
+"""Takes a recording, the failure's first stamp (ns), the stamp after its last, and a generator; returns the change."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,8 +56,8 @@ class Failure:
     """A failure that can be injected.
 
     Attributes:
-        name: for tables, unique. family: shared by failures that differ only in length, which form a curve.
-        length_s: how long it lasts. strike: the change of a recording.
+        name: for tables, unique. family: name that failures share which differ only in length; they form a curve.
+        length_s: duration. strike: changes a recording.
     """
 
     name: str
@@ -74,10 +74,10 @@ class Failure:
 def script(
     recording: Recording, config: VesselConfig | None = None
 ) -> tuple[tuple[Failure, ...], tuple[tuple[str, str], ...]]:
-    """Return the failures that are possible with a recording's sensors; of the others, names and reasons.
+    """Return the failures that are possible with a recording's sensors, and names and reasons of the others.
 
     Args:
-        config: which sensors are of one receiver; None: each is of its own.
+        config: tells which sensors read one receiver; None: each reads its own.
     """
     has = {kind: any(isinstance(m, kind) for m in recording.measurements) for kind in _KINDS}
     receivers = {} if config is None else {name: config.receiver_of(name) for name in config.sensors}
@@ -191,7 +191,11 @@ def _jump(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Gener
 
 
 def _frozen(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator, *, receivers: Mapping[str, str]) -> Struck:  # fmt: skip
-    """Repeat what each receiver said last, under new stamps, as a driver does whose receiver hangs; `receivers`: of sensors."""
+    """Repeat the last measurements of each receiver under new stamps, as the driver of a receiver that hangs does.
+
+    Args:
+        receivers: name of the receiver, by sensor.
+    """
     last: dict[tuple[str, type[Measurement]], Measurement] = {}
     held: dict[int, Measurement] = {}
     for m in sorted(recording.measurements, key=lambda m: m.stamp_ns):
@@ -217,7 +221,7 @@ def _turned(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Gen
 
 
 def _false(recording: Recording, begin_ns: int, end_ns: int, rng: np.random.Generator, *, share: float, alike: bool) -> Struck:  # fmt: skip
-    """Displace a share of the poses: each independently, or all alike, as when a pier is taken for its neighbour."""
+    """Displace a share of the poses: each by itself or, if `alike`, equally, as if a pier were taken for the next."""
 
     def draw() -> dict[str, float]:
         size, angle = rng.uniform(*_FALSE_M), rng.uniform(0.0, 2.0 * np.pi)
@@ -252,7 +256,7 @@ def _flipped(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.G
 
 
 def _late(recording: Recording, begin_ns: int, end_ns: int, _rng: np.random.Generator, *, late_s: float) -> Struck:
-    """Delay measurements that take a computer time; their stamps stay right."""
+    """Delay the arrival of measurements that are computed, as matches; their stamps stay right."""
     late = [m for m in recording.measurements if isinstance(m, PoseFix | TagSighting) and _during(m, begin_ns, end_ns)]
     return Struck(recording=recording, late_ns={m.seq: round(late_s * NS_PER_S) for m in late})
 

@@ -11,7 +11,7 @@ from graphloc.eval.drill.measure import Drilled, Row, Times, summed
 from graphloc.eval.drill.plan import TAIL_S, Case
 from graphloc.eval.plots import Figure, Line, Mark, Panel, Points, Shaded, Shape, colour_of
 
-_SHOWN_S = 10.0  # of an error over time, before the failure
+_SHOWN_S = 10.0  # time before the failure that is shown of an error over time
 _FEWEST_M = 0.05  # lower end of logarithmic axes
 _PANEL_PX, _BESIDE_PX = 190, 100
 
@@ -22,7 +22,10 @@ def _range_m(most_m: float) -> tuple[float, float]:
 
 
 def against_length(drilled: Drilled) -> Figure | None:
-    """Return the figure of largest errors against the length of an outage, a panel per kind; a cross: never recovered."""
+    """Return the figure of largest errors against the length of an outage, a panel per kind.
+
+    A cross means that the estimator did not recover.
+    """
     rows = summed(drilled.measured)
     families = [
         f for f in dict.fromkeys(r.family for r in rows) if len({r.length_s for r in rows if r.family == f}) > 1
@@ -54,7 +57,7 @@ def _off_m(rows: Sequence[Row]) -> np.ndarray:
 
 
 def _points(rows: Sequence[Row], name: str, x: np.ndarray, y: np.ndarray, size: float, *, listed: bool) -> list[Mark]:
-    """Yield a circle for each failure, or a cross if the estimator never recovered."""
+    """Return a circle for each failure, or a cross where the estimator did not recover."""
     never = np.array([bool(r.lost or r.none) for r in rows], dtype=bool)
     shapes: tuple[tuple[Shape, np.ndarray], ...] = (("circle", ~never), ("x", never))
     text = [f"{r.failure}<br>{name}: {r.off_m:.2f} m" for r in rows]
@@ -69,7 +72,10 @@ def _points(rows: Sequence[Row], name: str, x: np.ndarray, y: np.ndarray, size: 
 
 
 def all_failures(drilled: Drilled) -> Figure:
-    """Return the figure of the largest error in each failure: a mark per estimator, a cross: never recovered; hollow: undisturbed."""
+    """Return the figure of the largest error in each failure, a mark per estimator.
+
+    A cross means that the estimator did not recover; a hollow mark is its largest error without the failure.
+    """
     rows = summed(drilled.measured)
     names = list(dict.fromkeys(r.failure for r in rows))[::-1]
     marks: list[Mark] = []
@@ -89,7 +95,7 @@ def all_failures(drilled: Drilled) -> Figure:
 
 
 def over_time(drilled: Drilled) -> Figure:
-    """Return the figure of each estimator's error over time, at the first injection of each failure, which is shaded."""
+    """Return the figure of the estimators' errors over time, at the first injection of each failure (shaded)."""
     first: dict[str, tuple[Case, dict[str, Times]]] = {}
     for case, times in drilled.shown:
         first.setdefault(case.failure.name, (case, times))

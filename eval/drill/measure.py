@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of an estimator with a failure: how large, how long until it recovers, whether its bounds hold."""
+"""Errors of an estimator with a failure: how large they are, how long it takes to recover, whether its bounds hold."""
 
 from __future__ import annotations
 
@@ -18,8 +18,11 @@ from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
 
 RATE_HZ = 5.0
-NEAR_M, NORMAL_TIMES = 1.0, 1.5  # back: nearer than 1 m, or than 1.5 times what the same estimator has undisturbed
-HOLDS_S, HELD = 5.0, 0.9  # for so long, this share of it within its own 95 % bound
+# An estimate is near if its error is below 1 m, or below 1.5 times that of the same estimator without the failure.
+NEAR_M, NORMAL_TIMES = 1.0, 1.5
+# It has recovered once it is near for so long (s), and the reference lies in its 95 % bound for this share of that
+# time.
+HOLDS_S, HELD = 5.0, 0.9
 
 
 class State(enum.StrEnum):
@@ -27,7 +30,7 @@ class State(enum.StrEnum):
 
     BACK = "back"
     UNSURE = "unsure"  # near again, but outside its own 95 % bounds
-    LOST = "lost"  # locked out: not near again while it is looked at
+    LOST = "lost"  # locked out: not near again in the time that is evaluated
     NONE = "none"  # it gave no estimate
 
 
@@ -36,8 +39,9 @@ class Times:
     """Errors of an estimate relative to the reference, at times (N,).
 
     Attributes:
-        stamps_ns: a grid of `RATE_HZ`. there: whether there is an estimate. off_m, off_deg: horizontal distance and
-            difference of heading, NaN without an estimate. held: whether its 95 % region holds the reference.
+        stamps_ns: a grid of `RATE_HZ`. there: whether there is an estimate.
+        off_m, off_deg: horizontal distance and difference of heading; NaN without an estimate.
+        held: whether the estimate's 95 % region holds the reference.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -49,12 +53,14 @@ class Times:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
-    """Errors of one estimator with one failure at one time; `normal_*`: the same without the failure.
+    """Errors of one estimator with one failure at one time; `normal_*` are those without the failure.
 
     Attributes:
-        begin_s: since the recording begins. off_m, off_deg: largest, until `TAIL_S` after the failure.
+        failure, family, length_s: as of `Failure`. begin_s: of the failure, since the recording begins.
+        estimator: its name. state: outcome. off_m, off_deg: largest errors, until `TAIL_S` after the failure.
         coverage: share of that time in which the 95 % region of the position holds the reference; None: no estimate.
-        back_s: from the failure's end until it has recovered. missing: share of the time without an estimate. why: of that.
+        back_s: from the failure's end until the estimator has recovered; None: it does not.
+        missing: share of the time without an estimate. why: reason that there is none.
     """
 
     failure: str
@@ -75,10 +81,11 @@ class Measured:
 
 
 def compared(track: Trajectory | None, reference: Trajectory, window: DrillWindow, *, sure: bool) -> Times:
-    """Return the errors of an estimate over a window; None: there is no estimate.
+    """Return the errors of an estimate over a window.
 
     Args:
-        sure: the reference is truth; otherwise its own covariance is added to the estimate's.
+        track: the estimate; None: there is none.
+        sure: whether the reference is truth; if not, its covariance is added to the estimate's.
     """
     count = int((window.end_ns - window.begin_ns) / NS_PER_S * RATE_HZ)
     stamps = window.begin_ns + np.rint(np.arange(count) * NS_PER_S / RATE_HZ).astype(np.int64)
@@ -101,7 +108,8 @@ def judge(case: Case, estimator: str, struck: Times, normal: Times, origin_ns: i
     """Return the errors of an estimator with a failure.
 
     Args:
-        struck, normal: of the same window, with the failure and without. origin_ns: begin of the recording.
+        case, estimator: which. struck, normal: errors over one window, with the failure and without it.
+        origin_ns: begin of the recording. why: reason that there is no estimate.
     """
     stamps, tail_ns = struck.stamps_ns, round(TAIL_S * NS_PER_S)
     judged = (stamps >= case.begin_ns) & (stamps < case.end_ns + tail_ns)
@@ -151,7 +159,7 @@ def _back(times: Times, end_ns: int, near_m: float) -> tuple[State, float | None
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """All injections of one failure, for one estimator: the worst errors, and how often it did not recover."""
+    """All `times` injections of a failure, for one estimator: worst errors, and number of each bad outcome."""
 
     failure: str
     family: str
@@ -208,10 +216,12 @@ class Drilled:
     """Result of a drill.
 
     Attributes:
-        source, vessel: of the recording. truth: whether the reference is truth, else the undisturbed smoother.
+        source, vessel: of the recording. truth: whether the reference is truth; if not, it is the smoother without
+            failures.
         bound_m: median 95 % bound of that smoother.
-        measured: each failure, time and estimator. shown: errors of each estimator over time, by case.
+        measured: errors of each estimator, failure and time. shown: errors of each estimator over time, by case.
         left: failures that were not injected, with reasons. windows: parts of the recording that were used.
+        warnings: on the drill.
     """
 
     source: str
@@ -226,5 +236,5 @@ class Drilled:
 
     @property
     def estimators(self) -> tuple[str, ...]:
-        """Their names, in order."""
+        """Names of the estimators, in order."""
         return tuple(dict.fromkeys(m.estimator for m in self.measured))

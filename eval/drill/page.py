@@ -14,7 +14,7 @@ from graphloc.eval.drill.plan import TAIL_S, WINDOW_TAIL_S
 from graphloc.eval.html import drawing
 from graphloc.eval.page import Cell, Grid, write_csv, write_markdown, write_page
 
-MARK = "drill.json"  # a folder with this file is ours to replace
+MARK = "drill.json"  # a folder with this file was written here, and may be replaced
 
 
 def said(drilled: Drilled) -> list[str]:
@@ -98,14 +98,14 @@ def _rows(drilled: Drilled, cell_of: Callable[[Row], Cell]) -> tuple[tuple[Cell,
 
 
 def brief(drilled: Drilled) -> list[Grid]:
-    """Return the tables for a terminal: largest error and time to recover; a star: recovered, but outside its own bounds."""
+    """Return the tables for a terminal: largest error, and time to recover (a star: outside the estimator's bounds)."""
     rows = _rows(drilled, _short)
     title = "Farthest off, s until back (*: near, but outside its own 95 % bounds)"
     return [Grid(title=title, head=("failure", *drilled.estimators), rows=rows), *grids(drilled)[1:]]
 
 
 def grids(drilled: Drilled) -> list[Grid]:
-    """Return the table of failures, and that of failures that were not injected."""
+    """Return the table of failures, and a table of failures that were not injected."""
     times = max(r.times for r in summed(drilled.measured))
     table = Grid(
         title=f"Drills, each at {times} time{'s' if times > 1 else ''}",

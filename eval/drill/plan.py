@@ -12,15 +12,15 @@ from graphloc.eval.drill.failures import Failure
 from graphloc.recording import Recording
 from graphloc.time import NS_PER_S
 
-LEAD_S, TAIL_S = 25.0, 25.0  # an estimator has settled before a failure; what comes after it is judged
-WHOLE_S = 600.0  # a longer recording is cut into windows
+LEAD_S, TAIL_S = 25.0, 25.0  # time before a failure, so that estimators have settled, and after it, which is evaluated
+WHOLE_S = 600.0  # length from which a recording is cut into windows
 WINDOW_LEAD_S, WINDOW_TAIL_S = 60.0, 60.0
-_SETTLED_S = 10.0  # after the online mode's first pose
+_SETTLED_S = 10.0  # time after the online mode's first pose, before a failure may begin
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DrillWindow:
-    """A part of the recording for the estimators: its stamps, and whether it is the whole."""
+    """A part of the recording for the estimators: stamps of begin and end, and whether it is the whole."""
 
     begin_ns: int
     end_ns: int
@@ -29,7 +29,7 @@ class DrillWindow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """One failure at one time, in a window (its number); `seed` of its random choices."""
+    """One failure that begins at one stamp, in the window of that number; `seed`: of its random choices."""
 
     failure: Failure
     window: int
@@ -58,10 +58,12 @@ def schedule(
 ) -> tuple[tuple[Case, ...], tuple[tuple[str, str], ...]]:
     """Return the cases, and the failures that do not fit, with reasons.
 
-    In a whole recording the times are spread evenly over those at which the failure fits; in a window it is injected once.
+    In a whole recording the times are spread evenly over those at which the failure fits. In a window of a long one it
+    is injected once.
 
     Args:
-        ready_ns: by window, the first pose of the online mode.
+        failures: to inject. parts: windows. ready_ns: stamp of the online mode's first pose, by window.
+        times: injections of each failure. seed: of all random choices.
     """
     cases: list[Case] = []
     left: list[tuple[str, str]] = []
@@ -87,13 +89,13 @@ def schedule(
 
 
 def judged_until(case: Case, window: DrillWindow) -> DrillWindow:
-    """Return the window without what is more than `WINDOW_TAIL_S` after the failure, which is not evaluated."""
+    """Return the window up to `WINDOW_TAIL_S` after the failure: later errors are not evaluated."""
     end_ns = min(window.end_ns, case.end_ns + round(WINDOW_TAIL_S * NS_PER_S))
     return replace(window, end_ns=end_ns, whole=window.whole and end_ns == window.end_ns)
 
 
 def cut(recording: Recording, window: DrillWindow) -> Recording:
-    """Return the part of a recording in a window, with the whole truth, without the rows of other messages."""
+    """Return the part of a recording in a window: with the whole truth, without ledger rows of other messages."""
     if window.whole or recording.imu is None:
         return recording
     inside = (recording.imu.stamps_ns >= window.begin_ns) & (recording.imu.stamps_ns <= window.end_ns)

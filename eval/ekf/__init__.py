@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """EKFs for comparison with the graph, on the same measurements.
 
-`run_bl` is BL alg. 6 as printed, with its 2 m gate; the Jacobian that it lacks is an option. `run_honest` is a planar EKF that a
-fair comparison needs: exact Jacobian, gyro bias, GNSS velocity, chi-square gates that open as the covariance grows. State of both:
-x, y (m, world), surge, sway (m/s, body), heading psi (rad); then the gyro bias.
+`run_bl` is BL alg. 6 as printed, with its 2 m gate; the terms that the printed Jacobian lacks are an option.
+`run_honest` is a planar EKF for a fair comparison: exact Jacobian, gyro bias, GNSS velocity, chi-square gates that open
+as the covariance grows. The state of each is x, y (m, world), surge, sway (m/s, body), heading psi (rad); `run_honest`
+adds the gyro bias.
 """
 
 from __future__ import annotations
@@ -22,5 +23,5 @@ __all__ = ["BlConfig", "FilterResult", "as_pose", "filter_row", "named_tracks", 
 def run_all(
     recording: Recording, config: VesselConfig, datum: Datum, options: BlConfig | None = None
 ) -> tuple[FilterResult, ...]:
-    """Run both EKFs; `options`: of BL's."""
+    """Run the two EKFs; `options`: of `run_bl`."""
     return (run_bl(recording, config, datum, options), run_honest(recording, config, datum))

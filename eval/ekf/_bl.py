@@ -19,16 +19,18 @@ from graphloc.recording import Recording
 class BlConfig:
     """Parameters of BL alg. 6. Defaults are the printed ones, with errata corrected (dt, rad, 3 x 5 H).
 
+    R_lidar is a3 times the pose's own covariance; poses of BL's matcher (`matcher: bl` of an aerial sensor) have that
+    of eq. 3.33.
+
     Attributes:
         rate_hz: prediction rate. a1, a2, a3: BL's factors on Q, R_gnss, R_lidar.
         a2_in_loss: factor on R_gnss while the signal is lost, which BL set by hand. loss_ns: (start, stop)
-            stamps of that; None: unknown to the filter.
+            stamps of the loss; None: unknown to the filter.
         gate_m: a pose farther than this from the prediction is dropped.
-        accel_noise_mg: printed 37 mg; gyro_noise_dps: 0.008 deg/s; both over the root of the rate (eq. 3.1, 3.2).
-        gnss_rmse_m: receiver's own e; 0: from the fix. heading_rmse_deg: of the GNSS compass.
-        exact_jacobian: d/dpsi terms in F, which the print lacks.
-
-    R_lidar is a3 times the pose's own covariance: that of eq. 3.33 for poses of BL's matcher (`matcher: bl` of an aerial sensor).
+        accel_noise_mg, gyro_noise_dps: printed as 37 mg and 0.008 deg/s; divided by the root of the rate (eq. 3.1,
+            3.2).
+        gnss_rmse_m: the receiver's e; 0: from the fix. heading_rmse_deg: of the GNSS compass.
+        exact_jacobian: whether F has the d/dpsi terms, which the printed one lacks.
     """
 
     rate_hz: float = 20.0

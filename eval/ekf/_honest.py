@@ -18,7 +18,7 @@ from graphloc.time import NS_PER_S
 
 _RATE_HZ, _DT_S = 20.0, 0.05
 _ACCEL, _GATE, _PATIENCE_S = 0.3, 0.9, 10.0
-_MEAN_S = 20.0  # over which the accelerometer's bias is taken, as in `Interval`
+_MEAN_S = 20.0  # time over which the mean acceleration counts as bias and tilt, as in `Interval`
 
 
 class _HonestEkf:
@@ -35,9 +35,9 @@ class _HonestEkf:
         self._count = Counter(self._receiver_of(m) for m in recording.measurements)
         self._span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S if imu is not None and len(imu) else 1.0
         self._agreed_ns: dict[str, int] = {}
-        self._recent: deque[Array] = deque(maxlen=round(_MEAN_S * _RATE_HZ))  # accelerations without those of turning
-        self._sum = np.zeros(2)  # of these
-        self._rate = 0.0  # of the last step, rad/s
+        self._recent: deque[Array] = deque(maxlen=round(_MEAN_S * _RATE_HZ))  # accelerations, that of turning removed
+        self._sum = np.zeros(2)  # of `_recent`
+        self._rate = 0.0  # yaw rate in the last step, rad/s
 
     def start(self, x: Array) -> tuple[Array, Array]:
         return np.append(x, 0.0), np.diag([1.0, 1.0, 1.0, 1.0, np.radians(5.0) ** 2, np.radians(0.5) ** 2])
@@ -47,8 +47,8 @@ class _HonestEkf:
         return x, F @ P @ F.T + Q
 
     def moved(self, x: Array, step: Interval) -> tuple[Array, Array, Array]:
-        """Return the state (6,) one step later, F (6, 6) and the noise that comes to it."""
-        # In a turn the body's axes rotate under its velocity: dv/dt = a - w x v, which the print leaves out.
+        """Return the state (6,) one step later, F (6, 6) and the process noise Q (6, 6)."""
+        # In a turn the body's axes rotate under its velocity: dv/dt = a - w x v. BL's printed model leaves that out.
         rate = self._rate = step.rate - x[5]
         turning = rate * np.array([x[3], -x[2]])
         bias = self._mean_with(step.accel + turning)
@@ -72,11 +72,11 @@ class _HonestEkf:
         return R
 
     def _receiver_of(self, m: Measurement) -> str:
-        """Return the sensor that stands for all that read one receiver by turns: it is one to a filter."""
+        """Return the sensor that stands for all that read one receiver by turns: to this filter they are one sensor."""
         return self._receivers.get(m.sensor, m.sensor)
 
     def _mean_with(self, accel: Array) -> Array:
-        """Return the mean acceleration (2,) of the last seconds, with this one."""
+        """Return the mean acceleration (2,) of the last `_MEAN_S`, the given one included."""
         if len(self._recent) == self._recent.maxlen:
             self._sum -= self._recent.popleft()
         self._recent.append(accel)
@@ -84,7 +84,10 @@ class _HonestEkf:
         return np.asarray(self._sum / len(self._recent))
 
     def _slow(self, m: Measurement, size: int) -> Array:
-        """Return the covariance (size, size) of a slow error, which all measurements of a second share."""
+        """Return the covariance (size, size) to add for the slow error of a measurement.
+
+        It is multiplied by the measurements per second, which share the error.
+        """
         per_s = max(self._count[self._receiver_of(m)] / self._span_s, 1.0)
         if isinstance(m, GnssPosition):
             return np.eye(2) * per_s  # 1 m
@@ -108,10 +111,11 @@ class _HonestEkf:
 def run_honest(recording: Recording, config: VesselConfig, datum: Datum) -> FilterResult:
     """Run an EKF for a fair comparison.
 
-    Exact Jacobian, rotating body axes, gyro bias as a state, wave accelerations as process noise, GNSS velocity, a 90 % chi-square
-    gate for every sensor, a GNSS covariance that includes slow errors (1 m), that of poses their `slow_error`, and a speed log's scale, current and mount.
-    While measurements are rejected the covariance grows, so the gate opens again by itself; a sensor that was rejected for 10 s is
-    accepted again, so that nothing locks it out. The three values were chosen on seeds that no figure uses
+    It has the exact Jacobian, rotating body axes, the gyro bias as a state, wave accelerations as process noise, GNSS
+    velocity, and a 90 % chi-square gate for every sensor. The covariance of GNSS includes slow errors (1 m), that of
+    poses their `slow_error`, that of a speed log its scale, current and mount. While measurements are rejected the
+    covariance grows, so the gate opens again by itself. A sensor that was rejected for 10 s is accepted again, so that
+    it is never locked out. The wave accelerations, the gate and the 10 s were chosen on seeds that no figure uses
     (`benchmarks/tune_filter.py`).
     """
     return run_filter(_HonestEkf(recording, config), recording, config, datum)

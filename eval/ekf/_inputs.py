@@ -30,11 +30,15 @@ from graphloc.time import NS_PER_S, seconds_since
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Mean IMU data between two filter steps, in body axes, and whether it was missing."""
+    """Mean IMU data between two filter steps, in body axes.
+
+    Attributes:
+        stop_ns: stamp of the second step. rate: yaw rate, rad/s. silent: whether the data were missing.
+    """
 
     stop_ns: int
-    accel: Array  # (2,) surge, sway, with what tilt leaves of gravity
-    leak: Array  # (2,) their mean over the last 20 s: a planar filter knows no attitude, and takes it for that
+    accel: Array  # (2,) surge, sway, m/s^2, with the share of gravity that tilt adds
+    leak: Array  # (2,) mean of `accel` over the last 20 s: a planar filter knows no tilt, and takes this for its share
     rate: float
     silent: bool
 
@@ -79,7 +83,7 @@ def measurements_of(recording: Recording, config: VesselConfig) -> list[MountedM
         if isinstance(m, TagSighting) and sensor:
             m = as_pose(m, sensor.surveyed)
         if isinstance(m, BodyVelocity) and not {"x", "y"} & set(m.axes):
-            continue  # up and down: not in the plane
+            continue  # vertical only: the filters are planar
         planar = GnssPosition | GnssVelocity | BodyVelocity | CompassHeading | PoseFix
         if isinstance(m, planar) and sensor and sensor.enabled:
             t, R = mount_of(m.sensor, sensor, recording.mounts)
@@ -90,8 +94,8 @@ def measurements_of(recording: Recording, config: VesselConfig) -> list[MountedM
 def as_pose(m: TagSighting, survey: Survey) -> PoseFix:
     """Return the planar poses of body that a sighting of tags gives, likeliest first.
 
-    With t from the camera to the tags' middle c, the position is c - t; its covariance includes the errors of the attitude. The
-    position of a dock is uncertain by its configured motion.
+    With t from body to the tags' middle c, the position of body is c - t; its covariance includes the errors of the
+    attitude, and for tags on a dock the dock's configured motion.
     """
     modes, dock = [], survey.dock(m.frame)
     for mode in m.modes:
@@ -110,7 +114,7 @@ def as_pose(m: TagSighting, survey: Survey) -> PoseFix:
 
 
 def start_of(measured: list[MountedMeasurement], recording: Recording, datum: Datum) -> Array:
-    """Start as BL does: at the true pose if there is truth, else by the first fixes and heading."""
+    """Return the first five states (5,) as BL chooses them: the true pose, else by the first fixes and heading."""
     truth, imu = recording.truth, recording.imu
     if truth is not None and imu is not None and truth.covers(imu.stamps_ns[:1]).all():
         there = truth.at(imu.stamps_ns[:1])

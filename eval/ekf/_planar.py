@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts that both EKFs share: the planar model, the loop over steps and measurements, the resulting track."""
+"""Parts that the two EKFs share: the planar model, the loop over steps and measurements, the resulting track."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class FilterResult:
 
     Attributes:
         name: of the filter. trajectory: with covariance. ledger: of absolute measurements.
-        why: explanation of its errors, if needed.
+        why: explanation of the filter's errors, or empty.
     """
 
     name: str
@@ -105,7 +105,7 @@ def advance(x: Array, accel: Array, rate: float, dt: float) -> Array:
     return new
 
 
-SILENT_Q = np.diag([0.0, 0.0, 1.0, 1.0, 0.2**2])  # density of unknown motion in a gap of the IMU's data
+SILENT_Q = np.diag([0.0, 0.0, 1.0, 1.0, 0.2**2])  # density of the unknown motion in a gap of the IMU, per s
 
 
 class PlanarEkf(Protocol):
@@ -119,7 +119,7 @@ class PlanarEkf(Protocol):
     rate_hz: float
 
     def start(self, x: Array) -> tuple[Array, Array]:
-        """Return state and covariance at the start, from the first five states (5,)."""
+        """Return state (n,) and covariance (n, n) at the start, from the first five states (5,)."""
 
     def predict(self, x: Array, P: Array, step: Interval) -> tuple[Array, Array]:
         """Return state and covariance one step later."""
@@ -133,7 +133,7 @@ class PlanarEkf(Protocol):
 
 
 Shown = Callable[[Measurement, Array, Array, Array], tuple[Array, Array]]
-"""Measurement, state, innovation and H without further states -> innovation and H with them."""
+"""Takes measurement, state, and innovation and H by the planar model; returns these with the further states' part."""
 
 
 def run_filter(
@@ -146,7 +146,8 @@ def run_filter(
     """Predict step by step, and apply each measurement at the first step after it.
 
     Args:
-        shown: where measurements show states beyond place, velocity and heading.
+        ekf: the filter. recording, config, datum: its input. shown: for a filter whose measurements depend on states
+            beyond position, velocity and heading; by default none does.
     """
     intervals, measured = intervals_of(recording, config, ekf.rate_hz), measurements_of(recording, config)
     x, P = ekf.start(start_of(measured, recording, datum))
@@ -180,7 +181,7 @@ def _update(x: Array, P: Array, r: Array, H: Array, R: Array) -> tuple[Array, Ar
 def filter_row(
     m: Measurement, recording: Recording, nis: float | None, refused: str, away_m: float | None = None
 ) -> LedgerRow:
-    """Return the row of a measurement that a filter used, or rejected with a reason."""
+    """Return the ledger row of a measurement that a filter used, or rejected for a reason (`refused`)."""
     row = recording.row_of(m, Outcome.REJECTED if refused else Outcome.USED, refused)
     return replace(row, weight=0.0 if refused else 1.0, residual_m=away_m, nis=nis)
 

@@ -35,7 +35,8 @@ from graphloc.time import seconds_since
 from graphloc.trajectory import Trajectory, bounds_95
 
 HEALTH = {Health.DEGRADED: COLOURS[4], Health.DEAD_RECKONING: COLOURS[1], Health.LOST: "#780000"}
-_LOST, _SHOWN = 4.0, 1.2  # times the next larger error: who is beyond, and what is shown then
+# Of the second largest error: factor beyond which the largest is cut off, and factor up to which the figure then shows.
+_LOST, _SHOWN = 4.0, 1.2
 _OUTAGE_S, _OUTAGE_STEPS = 3.0, 5.0
 _SPANS = 300  # shades in a figure, the longest ones
 _SHARES = np.array([0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99])
@@ -52,7 +53,10 @@ def error_over_time(
     held: Sequence[GnssPosition],
     antennas: Antennas,
 ) -> Figure:
-    """Return the errors of position and heading against truth, else held-out fixes; 95 % bounds; outages and health."""
+    """Return the figure of errors of position and heading over time, with 95 % bounds, outages and health.
+
+    Errors are against truth, else at held-out fixes (position only); without these, only the bounds are shown.
+    """
     start = int(solution.trajectory.stamps_ns[0])
     shades = tuple(spans(recording, solution))
     position: list[Mark] = [*shades, _bound(solution, 0, listed=True)]
@@ -85,7 +89,7 @@ def error_over_time(
 
 
 def _bound(solution: Solution, column: int, *, listed: bool) -> Band:
-    """Return the band of a 95 % bound of the solution (`bounds_95`)."""
+    """Return the band of a 95 % bound of the solution: a `column` of `bounds_95`."""
     track = solution.trajectory
     assert track.cov is not None
     some = thinned(len(track))
@@ -96,7 +100,7 @@ def _bound(solution: Solution, column: int, *, listed: bool) -> Band:
 
 
 def _zoomed(largest_m: Mapping[str, float]) -> tuple[str, tuple[float, float] | None]:
-    """Return title and range of the position error, so that an estimate that is lost does not flatten the others."""
+    """Return title and range of the position error: a lost estimate must not flatten the curves of the others."""
     *_, second, first = [0.0, 0.0, *sorted(largest_m.values())]
     if not first > _LOST * second > 0.0:
         return "position error", None
@@ -105,7 +109,7 @@ def _zoomed(largest_m: Mapping[str, float]) -> tuple[str, tuple[float, float] | 
 
 
 def spans(recording: Recording, solution: Solution) -> Iterator[Shaded]:
-    """Yield the periods without fixes and those in which health was not good; of too many, the longest."""
+    """Yield the periods without fixes, and those in which health was not good; if too many, the longest."""
     start, found = int(solution.trajectory.stamps_ns[0]), []
     for a, b in outages(recording):
         found.append(Shaded(name="no GNSS fix", start=(a - start) / 1e9, stop=(b - start) / 1e9, colour=OUTAGE))
@@ -121,9 +125,9 @@ def spans(recording: Recording, solution: Solution) -> Iterator[Shaded]:
 
 
 def outages(recording: Recording) -> list[tuple[int, int]]:
-    """Return stamps (ns) of periods without a GNSS position for 3 s and five times the usual interval.
+    """Return begin and end (stamps, ns) of periods without a GNSS position for 3 s and five usual intervals.
 
-    The periods before the first and after the last one count, too, as far as there is an IMU.
+    The time before the first and after the last position counts, too, as far as there are IMU data.
     """
     stamps = np.unique([m.stamp_ns for m in recording.of(GnssPosition)])
     if len(stamps) < 3:
@@ -136,7 +140,7 @@ def outages(recording: Recording) -> list[tuple[int, int]]:
 
 
 def consistency(recording: Recording, solution: Solution, filters: Sequence[FilterResult]) -> Figure | None:
-    """Return the NEES of the horizontal position over time, with the band of 95 % probability; None without truth."""
+    """Return the figure of the NEES of the horizontal position over time, with its 95 % band; None without truth."""
     if recording.truth is None:
         return None
     start = int(solution.trajectory.stamps_ns[0])
@@ -164,7 +168,7 @@ def consistency(recording: Recording, solution: Solution, filters: Sequence[Filt
 
 
 def coverage(recording: Recording, solution: Solution, filters: Sequence[FilterResult]) -> Figure | None:
-    """Return how often the stated p % region held the truth, for all p: on the diagonal if it is honest."""
+    """Return the figure of how often the p % region held the truth, for all p; if honest, on the diagonal."""
     if recording.truth is None:
         return None
     wanted = 100.0 * _SHARES

@@ -60,7 +60,7 @@ def _empty(figure: Figure, above_px: int) -> go.Figure:
     """Return the axes of all panels, `above_px` below the top."""
     n, columns = len(figure.panels), figure.columns
     rows = -(-n // columns)
-    gap_px = _GAP_PX + (_TICKS_PX if columns > 1 else 0)  # beside each other, each has its own axis
+    gap_px = _GAP_PX + (_TICKS_PX if columns > 1 else 0)  # in columns, each panel has its own x axis
     return make_subplots(
         rows=rows, cols=columns, shared_xaxes=columns == 1, subplot_titles=[_title(p) for p in figure.panels],
         vertical_spacing=min(gap_px / max(figure.height - above_px - _BELOW_PX, 1), 0.9 / rows),
@@ -83,7 +83,7 @@ def _y_axis(panel: Panel) -> dict[str, Any]:
 
 
 def _shade(span: Shaded, number: int) -> dict[str, Any]:
-    """Return a rectangle over the height of a panel; plotly takes all at once, since one by one they take seconds."""
+    """Return a rectangle over the height of a panel as plain data: to add them one by one would take seconds."""
     axis = str(number) if number > 1 else ""
     return {
         "type": "rect", "xref": f"x{axis}", "yref": f"y{axis} domain", "x0": span.start, "x1": span.stop, "y0": 0, "y1": 1,
@@ -92,7 +92,7 @@ def _shade(span: Shaded, number: int) -> dict[str, Any]:
 
 
 def _title(panel: Panel) -> str:
-    """Return the title; of a panel with its own key, with the names of the lines in their colours."""
+    """Return the title of a panel; if the panel has its own key, with the names of its lines in their colours."""
     names = [f'<span style="color:{m.colour}">{m.name}</span>' for m in panel.marks if isinstance(m, Line)]
     return f"{panel.title} ({', '.join(names)})" if panel.keyed else panel.title
 

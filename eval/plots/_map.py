@@ -39,7 +39,11 @@ _HEIGHT_PX = 620
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """An absolute measurement: the position that it gives for body (a fix: its antenna), its kind, and its ledger row."""
+    """An absolute measurement on the map.
+
+    Attributes:
+        p_m: (2,) position that it gives for body; of a fix: for its antenna. kind: its type. row: its ledger row.
+    """
 
     p_m: Array
     kind: type[Measurement]
@@ -47,7 +51,7 @@ class Placed:
 
 
 def placed(recording: Recording, solution: Solution) -> Iterator[Placed]:
-    """Yield every measurement that gives a position, by the mode that was chosen, or its likeliest."""
+    """Yield every measurement that gives a position, by the chosen mode or, if none was chosen, the first one."""
     rows = {row.seq: row for row in solution.ledger if row.seq >= 0}
     for m in recording.measurements:
         row = rows.get(m.seq)
@@ -121,7 +125,7 @@ def _measured(recording: Recording, solution: Solution) -> Iterator[Points]:
 
 
 def _tags(recording: Recording) -> Iterator[Points]:
-    """Return the positions of the tags that were seen, docks at rest."""
+    """Yield the positions of the tags that were seen, docks at rest."""
     seen: dict[tuple[str, int], tuple[Array, str]] = {}
     for m in recording.measurements:
         if isinstance(m, TagSighting):

@@ -18,7 +18,7 @@ from graphloc.frames import Array
 COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#56B4E9")
 TRUTH, OUTAGE = "#000000", "#777777"
 _TRACKS = dict(zip(("graphloc", "graphloc online", "BL EKF", "honest EKF", "Digerud KF"), COLOURS, strict=False))
-MOST = 2000  # points a trace: more cannot be seen and make a heavy page
+MOST = 2000  # most points of a trace: more cannot be seen and make the page heavy
 
 Dash = Literal["solid", "dash", "dot"]
 Shape = Literal["circle", "circle-open", "diamond", "square", "x"]
@@ -26,7 +26,7 @@ Shape = Literal["circle", "circle-open", "diamond", "square", "x"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Named:
-    """What is drawn over x (N,). `listed`: whether the legend names it."""
+    """Base of marks that are drawn over x (N,); `listed`: whether the legend names the mark."""
 
     name: str
     x: Array
@@ -99,11 +99,11 @@ class Panel:
     """One pair of axes.
 
     Attributes:
-        title: above it; may be empty. y: label of the axis. marks: drawn in this order.
-        range_y: initial range of the axis; None: all.
-        from_zero: the axis begins at zero. log_y: it is logarithmic.
-        keyed: its lines are named in its title instead of the legend of the figure.
-        ticks_y: names of 0, 1, 2, ... on the axis, instead of numbers.
+        title: above the panel; may be empty. y: label of the y axis. marks: drawn in this order.
+        range_y: initial range of the y axis; None: all.
+        from_zero: whether the y axis begins at zero. log_y: whether it is logarithmic.
+        keyed: whether the lines are named in the title instead of the figure's legend.
+        ticks_y: names of 0, 1, 2, ... on the y axis, instead of numbers.
     """
 
     title: str
@@ -118,13 +118,13 @@ class Panel:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Figure:
-    """Panels below each other with a common x axis, or in `columns` with one each.
+    """Panels below each other with a common x axis, or in several columns with an x axis each.
 
     Attributes:
-        name: of its files, and in the page. x: label of the axis. height: of the whole, px.
-        columns: number of panels in a row. log_x: the x axes are logarithmic.
-        range_x: initial range of these; None: all.
-        is_map: x and y have the same scale; underlay: picture below.
+        name: of its files, and in the page. x: label of the x axis. panels: row by row. height: of the figure, px.
+        columns: number of panels in a row. log_x: whether the x axes are logarithmic.
+        range_x: initial range of the x axes; None: all.
+        is_map: whether x and y have the same scale. underlay: picture below the map; None: there is none.
     """
 
     name: str
@@ -151,7 +151,7 @@ def thinned(n: int, most: int = MOST) -> NDArray[np.int64]:
 
 
 def peaks(values: Array, most: int = MOST) -> NDArray[np.int64]:
-    """Return the indices of at most `most` of n values in order: the largest of each section, so that no peak is lost."""
+    """Return the indices of at most `most` of n values, in order: the largest of each section, so that peaks stay."""
     n = len(values)
     if n <= most:
         return np.arange(n)
@@ -162,7 +162,7 @@ def peaks(values: Array, most: int = MOST) -> NDArray[np.int64]:
 
 
 def shown_of(weight: Array, most: int = MOST) -> NDArray[np.int64]:
-    """Return the indices of at most `most` measurements; at least half of them have a weight below 0.5, if there are as many."""
+    """Return the indices of at most `most` measurements; at least half have a weight below 0.5, if so many do."""
     odd, even = np.flatnonzero(weight < 0.5), np.flatnonzero(weight >= 0.5)
     of_odd = min(len(odd), max(most // 2, most - len(even)))
     return np.sort(np.concatenate([odd[thinned(len(odd), of_odd)], even[thinned(len(even), most - of_odd)]]))

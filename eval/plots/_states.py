@@ -19,7 +19,7 @@ from graphloc.solution import SlowEstimate, Solution
 from graphloc.time import seconds_since, stamps_of
 
 _PANEL_PX, _BESIDE_PX = 170, 120
-_SEEN_SIGMAS = 8.0  # of residuals at first; a double click shows all
+_SEEN_SIGMAS = 8.0  # residuals that are shown at first; a double click shows all
 
 
 def _stacked(name: str, panels: Sequence[Panel]) -> Figure:
@@ -27,7 +27,7 @@ def _stacked(name: str, panels: Sequence[Panel]) -> Figure:
 
 
 def berths_over_time(solution: Solution) -> Figure | None:
-    """Return the vessel's position relative to each berth: across and along, angle, with 95 % bands; None if it was near none."""
+    """Return the figure of the vessel relative to each berth (across, along, angle), 95 % bands; None: near none."""
     start, panels = int(solution.trajectory.stamps_ns[0]), []
     for track in solution.berths:
         assert track.cov is not None
@@ -88,7 +88,7 @@ def residuals_over_time(solution: Solution) -> Figure | None:
 
 
 def slow_over_time(solution: Solution) -> Figure:
-    """Return the slow states (of fixes and poses, compass offset, image offset, ...) with 95 % bands, and IMU biases."""
+    """Return the figure of slow errors (of fixes, poses, compass, image, ...) with 95 % bands, and of IMU biases."""
     start = int(solution.trajectory.stamps_ns[0])
     panels = [panel for sensor, estimate in solution.slow.items() for panel in _slow_panels(start, sensor, estimate)]
     stamps, axes = solution.trajectory.stamps_ns, ("x", "y", "z")
@@ -101,7 +101,7 @@ def slow_over_time(solution: Solution) -> Figure:
 
 
 def _slow_panels(start: int, sensor: str, e: SlowEstimate) -> list[Panel]:
-    """Return a panel per unit, of at most three axes."""
+    """Return the panels of a sensor's slow error: one for each unit and at most three axes."""
     panels = []
     for unit in dict.fromkeys(e.units):
         every = [k for k, u in enumerate(e.units) if u == unit]

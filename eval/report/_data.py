@@ -21,11 +21,13 @@ class ReportData:
     """Everything that a report needs.
 
     Attributes:
-        solution: of the run. online: of the online mode on the same measurements, if it was compared.
+        title: of the page. solution: of the run. recording, config: its input. filters: results of the EKFs.
         held: fixes that were held out. antennas: of the receivers, in body.
-        tables: the metrics. truth_statement: what these were measured against.
-        pictures: captions and JPEGs of matches. underlay: the aerial image under the map.
-        calibration: suggestions of an offline run. command: the command line.
+        tables: the metrics. truth_statement: what the metrics were measured against.
+        pictures: captions and JPEGs of matches. underlay: the aerial image under the map; None: there is none.
+        calibration: checks and suggestions of an offline run; None: there are none.
+        online: solution of the online mode on the same measurements; None: it was not compared.
+        command: the command line.
     """
 
     title: str
@@ -55,12 +57,12 @@ class ReportData:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """All warnings, as `all_warnings` gives them."""
+        """All warnings of the run (`all_warnings`)."""
         return all_warnings(self.recording, self.solution, self.online)
 
 
 def all_warnings(recording: Recording, solution: Solution, online: Solution | None) -> tuple[str, ...]:
-    """Return the warnings of a run, then those that only the online mode gave, under its name."""
+    """Return the warnings of a run, then the warnings that only the online mode gave, under its name."""
     own = (*recording.warnings, *solution.stats.warnings)
     if online is None:
         return own
@@ -68,7 +70,7 @@ def all_warnings(recording: Recording, solution: Solution, online: Solution | No
 
 
 def figures(data: ReportData) -> dict[str, plots.Figure]:
-    """Return the figures of a run by name, without those that it has no data for."""
+    """Return the figures of a run by name; figures without data are left out."""
     recording, solution, filters = data.recording, data.solution, data.filters
     found = (
         plots.run_map(recording, solution, filters, data.held, data.underlay),

@@ -16,13 +16,13 @@ from graphloc.frames import Array
 from graphloc.solution import Cause, Health, HealthReason, Solution
 from graphloc.time import seconds_since
 
-_MOST = 12  # reasons that a table has
-_STEP_S = 1.0  # between two poses: beyond, there was no estimate (as `Trajectory.covers` has it)
+_MOST = 12  # most reasons in a table
+_STEP_S = 1.0  # longest time between two poses; in a longer gap there was no estimate (as in `Trajectory.covers`)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stretch:
-    """A period of constant health: begin and end in s since the run's track begins, and the reason at its begin."""
+    """A period of constant health: begin and end, in s since the origin of times, and the reason at its begin."""
 
     health: Health
     reason: HealthReason
@@ -50,10 +50,10 @@ def shares(solution: Solution) -> dict[Health, float]:
 
 
 def stretches(solution: Solution, begin_ns: int) -> list[Stretch]:
-    """Return the periods in which health was not good; neighbours whose reasons differ only in numbers are one.
+    """Return the periods in which health was not good; neighbours whose reasons differ only in numbers are joined.
 
     Args:
-        begin_ns: origin of their times.
+        begin_ns: origin of the times.
     """
     t = seconds_since(begin_ns, solution.trajectory.stamps_ns)
     ends = t + _lasting_s(solution)
@@ -72,7 +72,7 @@ def stretches(solution: Solution, begin_ns: int) -> list[Stretch]:
 
 
 def said_of(solution: Solution) -> str:
-    """Return the states of health with shares and durations, such as 'good for 80 % (64 s), degraded for 20 % (16 s)'."""
+    """Return the states of health with shares and durations, as 'good for 80 % (64 s), degraded for 20 % (16 s)'."""
     lasting = durations_s(solution)
     parts = [f"{_words(h)} for {percent(share)} ({_seconds(lasting[h])})" for h, share in shares(solution).items()]
     return ", ".join(parts)

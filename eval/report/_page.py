@@ -21,8 +21,8 @@ from graphloc.eval.report._data import ReportData, figures
 from graphloc.eval.report._theses import theses_section
 from graphloc.eval.report._verdict import verdict
 
-# A finger scrolls the page, not the figure. A narrow screen needs room for the legend, and none above and below a wide map.
-# On paper figures take the sheet's width, and leave room for their heading.
+# Touch scrolls the page, not the figure. On a narrow screen a figure is higher, for its legend, and a wide map lower.
+# On paper, figures have the sheet's width and leave room for their heading.
 _SCRIPT = """
 addEventListener("load",()=>{const all=()=>[...document.querySelectorAll(".js-plotly-plot")];
 const tall=(p,h)=>{p.style.height=h+"px";p.parentElement.style.height="auto";return h};

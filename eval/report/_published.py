@@ -12,7 +12,12 @@ from typing import NamedTuple
 
 
 class BlRun(NamedTuple):
-    """A run of BL: RMSE and largest error of position (m) and heading (deg), with GNSS as truth."""
+    """A run of BL: RMSE and largest error of position (m) and heading (deg), with GNSS as truth.
+
+    Attributes:
+        case, noise: of the run. measured_table, measured_m: table of the errors of the disturbed GNSS, and the errors.
+        table, position_m, heading_deg: table of the errors of BL's EKF, and the errors.
+    """
 
     case: int
     noise: str

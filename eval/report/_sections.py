@@ -23,7 +23,7 @@ _KNOWS = {
 }
 _COLOUR = {Trust.YES: "#009E73", Trust.WITH_CARE: "#E69F00", Trust.NO: "#D55E00"}
 _CLASS = {Trust.YES: "", Trust.WITH_CARE: "care", Trust.NO: "no"}
-# What the first table says of each estimate, where a run has it: column, heading, digits.
+# Columns of the first table, shown if a run has them: name, heading, digits.
 _KEY = (
     ("position_rmse_m", "RMSE, m", 2), ("horizontal_rmse_m", "RMSE, m", 2), ("position_p95_m", "95 %, m", 2),
     ("horizontal_p95_m", "95 %, m", 2), ("position_max_m", "worst, m", 2), ("horizontal_max_m", "worst, m", 2),
@@ -31,7 +31,7 @@ _KEY = (
     ("heading_rmse_deg", "heading RMSE, °", 2),
 )  # fmt: skip
 _SHARES = (("coverage_95", "in 95 % bounds"), ("matched", "covered"))
-_WIDE = ("95 %, m", "worst, m", "covered")  # a phone does without
+_WIDE = ("95 %, m", "worst, m", "covered")  # columns that a phone hides
 
 
 def first_screen(data: ReportData, verdict: RunVerdict) -> str:
@@ -56,7 +56,7 @@ def first_screen(data: ReportData, verdict: RunVerdict) -> str:
 
 
 def _key_numbers(data: ReportData) -> str:
-    """Return the main table, and what must be known of its estimates."""
+    """Return the main table, and remarks that are needed to read it."""
     found = main_table(data)
     if found is None:
         return ""
@@ -68,7 +68,11 @@ def _key_numbers(data: ReportData) -> str:
 
 
 def _key_table(whole: Table, key: str, ours: str) -> str:
-    """Return the main table, one row per estimate, so that it fits a phone; `key`: the column by which they are compared with `ours`."""
+    """Return the main table, one row per estimate, so that it fits a phone.
+
+    Args:
+        whole: the metrics. key: column by which the estimates are compared. ours: name of the estimate to compare with.
+    """
     values = whole.as_dict()
     told = {c for c in whole.columns if any(row[c] is not None for row in values.values())}
     first, *columns = [column for column in _KEY if column[0] in told]

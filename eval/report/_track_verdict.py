@@ -24,26 +24,29 @@ from graphloc.solution import CONTRADICTING_COST, Health, Solution
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory, bounds_95
 
-# Shares of a run, beyond which a reader has to look closer; choices.
-_MOSTLY = 0.5  # less of it called good
-_LOST = 0.05  # more of it called lost
-_COVERED = 0.85  # less of the truth inside the 95 % bounds: they are too small
-_NOT_COVERED = 0.5  # less of it inside: no bound can be relied on
-_MATCHED = 0.95  # less of what the track is compared with, covered by it
-_STARTED = 0.8  # the same online, where the start waits for position and heading
-_TOO_SURE = 4.0  # NEES: errors are 1.4 times what the covariance says
-# Of the time in which online's 95 % bounds hold the offline position: that one is better informed, so honest ones do for 95 %.
+# Limits of shares of a run, beyond which trust is reduced; choices.
+_MOSTLY = 0.5  # least share whose health is good
+_LOST = 0.05  # largest share whose health is lost
+_COVERED = 0.85  # least share of the truth inside the 95 % bounds: below, these are too small
+_NOT_COVERED = 0.5  # least share of the truth inside them: below, no bound can be relied on
+_MATCHED = 0.95  # least share of the reference that the track covers
+_STARTED = 0.8  # least share that an online track covers, whose start waits for position and heading
+_TOO_SURE = 4.0  # NEES from which bounds are too small: errors are 1.4 times what the covariance says
+# Least share of the time in which the online 95 % bounds hold the offline position. Honest bounds do for at least 95 %,
+# as the offline track is better informed.
 _HOLDS_OFFLINE = 0.9
 _PLACES = ("gnss", "pose", "aerial")
 _BESIDE_GNSS, _FEWEST_USED = ("pose", "aerial", "apriltag"), 10
-_GUESS = 0.25  # of a bound, above which a guess (95 %) makes a part of it that matters; a choice
-# Of a receiver from the track, for half of its fixes or more.
-_APART_M = 20.0  # farther than any multipath that lasts
-_APART_SIGMAS = 5.0  # of its slow error, where that is configured larger
-_STAYS = 0.5  # what of an error changes, as a share of what stays, up to which the latter is said to be wrong; a choice
-# Shares of what is compared that two tracks cover, apart by at most so much, so that a ratio says something; online starts seconds later.
+_GUESS = 0.25  # share of a bound, above which a guess (95 %) makes a part of it that matters; a choice
+# A receiver contradicts the track if half of its fixes are farther away than the larger of these:
+_APART_M = 20.0  # more than any lasting multipath
+_APART_SIGMAS = 5.0  # sigmas of its slow error as configured
+# RMS of the changing part of an error over its constant part, below which the error counts as constant; a choice
+_STAYS = 0.5
+# Largest difference of the shares of the reference that two tracks cover, for their errors to be compared by a ratio;
+# the online track starts seconds later.
 _ALIKE = 0.1
-_WORSE = 1.05  # times a filter's error, from which on ours is said to be larger
+_WORSE = 1.05  # ratio of our error to a filter's from which the filter is reported as more accurate
 
 
 class Trust(enum.IntEnum):
@@ -82,7 +85,7 @@ class TrackVerdict:
 
     @property
     def trust(self) -> Trust:
-        """The lowest level among the reasons."""
+        """The lowest level of trust among the reasons."""
         return worst(r.trust for r in self.reasons)
 
 
@@ -106,13 +109,13 @@ def track_verdict(data: ReportData, solution: Solution) -> TrackVerdict:
 
 
 def _doubted(solution: Solution) -> Iterator[Reason]:
-    """Yield what is wrong with the configuration or the recording: in a run whose health is poor anyway, nothing else up here says so."""
+    """Yield what is wrong with the configuration or the recording, as no bound includes it."""
     for why in solution.doubts:
         yield Reason(trust=Trust.WITH_CARE, text=f"No bound includes this: {why.rstrip('.')}.")
 
 
 def _bounds(solution: Solution) -> Iterator[Reason]:
-    """Yield the size of the 95 % bounds, and the health."""
+    """Yield a sentence on the size of the 95 % bounds, and on the health."""
     assert solution.trajectory.cov is not None
     bound = float(np.percentile(bounds_95(solution.trajectory.cov)[:, 0], 95))
     called = shares(solution)
@@ -139,7 +142,7 @@ def _coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _constant(data: ReportData, solution: Solution) -> str:
-    """Return a sentence on an error that is the same throughout; empty where most of it changes."""
+    """Return a sentence on the position error if most of it is constant; else empty."""
     if data.recording.truth is None:
         return ""
     off = errors(solution.trajectory, data.recording.truth).position_m[:, :2]
@@ -172,11 +175,12 @@ def _heading_coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Yield receivers that most of the run contradicts: they are false, or what the track follows instead.
+    """Yield a sentence on each receiver that is far from the track for most of the run.
 
-    A fix that is off by more, or a jump for a while, is what the graph is for; a survey or an image in a wrong place looks like
-    a receiver that is wrong all the time. One that is frozen is known to be wrong, and so is one that another receiver and a sensor
-    beside GNSS contradict.
+    Either the receiver is wrong, or what the track follows instead, as a survey or an image in a wrong place. Single
+    wrong fixes and jumps that end do not count, as the graph handles them; nor do fixes of a frozen receiver, which are
+    known to be wrong. If another receiver and a sensor beside GNSS agree with the track, the far receiver is the wrong
+    one.
     """
     track = solution.trajectory
     frozen = {row.seq for row in solution.ledger if row.reason.startswith(FROZEN)}
@@ -210,7 +214,10 @@ def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Yield suggested time offsets of position sensors that move the track, and of velocities that turn it, by more than its bounds."""
+    """Yield a sentence on each suggested time offset that matters.
+
+    It does if it moves the track (of a position sensor), or turns it (of a velocity), by more than its bounds.
+    """
     track = solution.trajectory
     if data.calibration is None or track.cov is None or track.v_world_mps is None:
         return
@@ -222,8 +229,8 @@ def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
         if isinstance(block, GnssConfig | AerialConfig) and block.stamp_sigma_s > 0.0:
             taken_s = solution.time_offsets_s.get(found.sensor)
             if isinstance(block, GnssConfig) or taken_s is None:
-                continue  # it is estimated, and in the bounds
-            off_s = abs(found.suggested - found.configured - taken_s)  # of what is far off, not all is taken
+                continue  # the delay is estimated, and the bounds include it
+            off_s = abs(found.suggested - found.configured - taken_s)  # a large delay is estimated only in part
         if found.unit == "s" and block.kind in _PLACES and off_s * speed_mps > bound_m:
             yield Reason(
                 trust=Trust.WITH_CARE,
@@ -233,7 +240,10 @@ def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _late_velocity(sensor: str, off_s: float, solution: Solution) -> Iterator[Reason]:
-    """Yield a velocity whose delay turns the heading by more than its bounds: by as much as the accelerations turn meanwhile, on average."""
+    """Yield a sentence on a velocity sensor whose delay `off_s` turns the heading by more than its bounds.
+
+    It turns the heading by as much as the accelerations turn within the delay, on average.
+    """
     track = solution.trajectory
     assert track.cov is not None
     assert track.v_world_mps is not None
@@ -252,9 +262,9 @@ def _late_velocity(sensor: str, off_s: float, solution: Solution) -> Iterator[Re
 
 
 def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Yield antennas that calibration puts elsewhere, or whose configured position is the default, and whether the bounds cover that.
+    """Yield a sentence on each antenna that calibration puts elsewhere, or whose configured position is the default.
 
-    Neither the bounds nor held-out fixes of the same receiver include such an error.
+    Neither the bounds nor held-out fixes of the same receiver show such an error.
     """
     track = solution.trajectory
     if data.recording.truth is not None or track.cov is None:
@@ -297,7 +307,11 @@ def _level_keys(name: str) -> list[str]:
 
 
 def _lever(data: ReportData, name: str, bound_m: float) -> Iterator[Reason]:
-    """Yield an antenna whose place is taken as configured, if that looks wrong or is the default; `bound_m`: of the position, 95 %, median."""
+    """Yield a sentence on an antenna whose place is not estimated, if the configured one looks wrong or is the default.
+
+    Args:
+        name: of the receiver. bound_m: median 95 % bound of the position.
+    """
     suggestions, checks = (data.calibration.suggestions, data.calibration.checks) if data.calibration else ((), ())
     keys = _level_keys(name)
     off_m = math.hypot(*(s.suggested - s.configured for s in suggestions if s.key in keys))
@@ -319,7 +333,7 @@ def _lever(data: ReportData, name: str, bound_m: float) -> Iterator[Reason]:
 
 
 def _origins(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Yield the cameras and LiDARs that were left at the vessel's origin: what they see places the vessel, and nothing else tells."""
+    """Yield a sentence on devices left at the vessel's origin: if they sit elsewhere, the track is off by as much."""
     if data.recording.truth is not None:
         return
     for name in (*data.config.of_kind("apriltag"), *data.config.of_kind("aerial")):
@@ -336,7 +350,7 @@ def _origins(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _beside(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Yield the filters that are more accurate, over the time that both tracks cover."""
+    """Yield a sentence on each filter that is more accurate, over the time that it and the track cover."""
     for filtered in data.filters:
         if filtered.name == (data.online.name if data.online else ""):
             continue
@@ -351,9 +365,10 @@ def _beside(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _errors_of_both(data: ReportData, solution: Solution, theirs: Trajectory) -> tuple[Array, Array] | None:
-    """Return the horizontal errors (M,), m, of a solution and of another track at the stamps that both cover; None if there are none.
+    """Return the horizontal errors (M,), m, of a solution and of another track at stamps that the two cover, or None.
 
-    Of held-out fixes as each predicts them: a filter that follows a drifting receiver is no better for it.
+    Without truth they are at held-out fixes, as predicted with the slow error where a track estimates it: else a filter
+    would seem better because it follows a drifting receiver.
     """
     truth, ours = data.recording.truth, solution.trajectory
     if truth is not None:
@@ -376,7 +391,7 @@ def _away(error: Array) -> Array:
 
 
 def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Yield the distance of the online track from the offline one, where there is no truth."""
+    """Yield a sentence on the distance of the online track from the offline one, if there is no truth."""
     if solution is not data.online or data.recording.truth is not None:
         return
     found = errors(solution.trajectory, data.solution.trajectory)
@@ -395,7 +410,7 @@ def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _compared(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Yield whether accuracy was measured, and over which share of the run."""
+    """Yield a sentence if accuracy was not measured, or over a part of the run only."""
     if main_table(data) is None:
         text = "Its accuracy was not measured: there is neither truth nor a held-out fix."
         if solution.stats.online and data.online is None:
@@ -416,7 +431,7 @@ def _compared(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _solved(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Yield convergence, cost and the number of warnings."""
+    """Yield sentences on convergence, cost and the number of warnings."""
     stats = solution.stats
     if stats.online:
         yield Reason(trust=Trust.YES, text="Online: each pose is what was known at that time.")
@@ -469,9 +484,9 @@ def _accuracy(data: ReportData, name: str) -> str:
             else f", over the {percent(covered)} that it covers"
         )
     others = {n: v for n, row in values.items() if n != name and (v := row[key]) is not None}
-    # No ratio to an error over a time that ours lacks, as that until it starts.
+    # No ratio to an error over a time that our track lacks, as the time before its start.
     alike = {n for n in others if abs((values[n].get("matched") or 1.0) - covered) <= _ALIKE}
-    if name != data.solution.name:  # the offline track is no rival: it knows what came later
+    if name != data.solution.name:  # the online track is not compared with the offline one, which knows later data
         others.pop(data.solution.name, None)
     beside = ", ".join(
         f"{n} {value:.2f} m" + (f" ({times(value, mine)})" if mine > 0.0 and n in alike else "")

@@ -14,7 +14,7 @@ class RunVerdict:
     """Verdict on a run.
 
     Attributes:
-        tracks: the run's own, then that of the online mode if it was compared.
+        tracks: verdict on the run's own track, then on that of the online mode if it was compared.
     """
 
     tracks: tuple[TrackVerdict, ...]

@@ -14,16 +14,20 @@ from graphloc.eval.simulate.rig import RigCamera
 from graphloc.frames import Array
 
 Image = NDArray[np.uint8]
-_MIDDLE_GREY = 0.2  # what the exposure makes the mean of an image, of white
+_MIDDLE_GREY = 0.2  # mean of an image that the exposure aims at, as a share of white
 _GAMMA = 2.2
 _LEVELS = 4096
 _HALOES = ((6.0, 0.02), (40.0, 0.015), (250.0, 0.01))  # stray light: width in px, share
-_LEAST_MOTION_PX = 0.3  # less does not show
+_LEAST_MOTION_PX = 0.3  # less motion cannot be seen
 
 
 @dataclass(frozen=True, slots=True)
 class Drop:
-    """A drop of water on the lens: middle and radius in px, from and until when in s, how it slides in px/s."""
+    """A drop of water on the lens.
+
+    Attributes:
+        at, radius: middle and radius, px. from_s, until_s: when it is there. slides: speed down the image, px/s.
+    """
 
     at: tuple[float, float]
     radius: float
@@ -52,10 +56,10 @@ def draw_drops(rng: np.random.Generator, camera: RigCamera, duration_s: float) -
 
 
 def exposure(picture: Picture, camera: RigCamera) -> tuple[float, float]:
-    """Return exposure (ms) and gain that make the mean grey, as far as both go."""
+    """Return exposure (ms) and gain that make the mean grey, as far as their limits allow."""
     light = picture[::8, ::8]
     scale = _MIDDLE_GREY / max(float(light.mean()), 1e-9)
-    for _ in range(8):  # what is clipped does not count beyond white
+    for _ in range(8):  # iterated, as clipped pixels count as white only
         scale *= _MIDDLE_GREY / max(float(np.minimum(light * scale, 1.0).mean()), 1e-9)
     at_gain_1 = scale * camera.full_well / camera.electrons_per_ms
     return min(at_gain_1, camera.longest_ms), float(np.clip(at_gain_1 / camera.longest_ms, 1.0, camera.highest_gain))
@@ -96,7 +100,7 @@ def _streak(motion_px: Array) -> Array:
 
 
 def _wet(picture: Picture, drop: Drop, t_s: float) -> None:
-    """Add drops, in which the surroundings appear upside down and out of focus."""
+    """Add a drop, in which the surroundings appear upside down and out of focus."""
     x, y = drop.at[0], drop.at[1] + drop.slides * (t_s - drop.from_s)
     low = np.maximum(np.floor([x - drop.radius, y - drop.radius]).astype(int), 0)
     high = np.minimum(np.ceil([x + drop.radius, y + drop.radius]).astype(int), picture.shape[::-1])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Light that reaches a camera: sky, water, walls and boats at a third of its resolution, tags at full resolution.
 
-Radiance is linear, in units of `weather`. Away from tags it only has to look as cluttered as a harbour; edges of tags have to be
-right to a hundredth of a pixel, so their pixels are the mean of many rays.
+Radiance is linear, in units of `weather`. Away from tags it only has to look as cluttered as a harbour. Edges of tags
+have to be right to a hundredth of a pixel, so their pixels are the mean of many rays.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ _ALBEDO = {
     "concrete": 0.45, "asphalt": 0.2, "wood": 0.35, "grass": 0.25, "roof": 0.3, "stone": 0.4, "building": 0.5,
     "steel": 0.4, "hull": 0.75, "cabin": 0.5,
 }  # fmt: skip
-_WALL = 0.6  # of the sky's light, what a wall gets
+_WALL = 0.6  # share of the sky's light that a wall gets
 _SKY, _SUN = 1.2, 3000.0
-_ASTRAY_PX = 0.05  # a ray that its lens takes elsewhere
+# Distance from its pixel at which a ray comes back through the lens model, from which that is invalid
+_ASTRAY_PX = 0.05
 _NEAREST_M = 0.1
 _PROUD_M = 0.05  # a tag may lie this far behind the face of its wall
 _STEP = 3  # pixels between rays of the background
@@ -41,7 +42,7 @@ _GRAIN = 512  # pixels of the tile that surfaces take their grain from
 
 
 def rays(camera: RigCamera, u_px: Array, v_px: Array) -> Rays:
-    """Return directions (N, 3), z = 1, in camera, of image points (N,); distortion undone."""
+    """Return directions (N, 3), with z = 1, in camera, of image points (N,), distortion undone."""
     points = np.column_stack([u_px, v_px])[:, None].astype(np.float64)
     if any(camera.distortion):
         # OpenCV's default stops after five steps, a third of a pixel off near the corners.
@@ -219,7 +220,7 @@ class Light:
         return np.asarray(albedo * light + self._lamps(at), dtype=np.float32)
 
     def _on_walls(self, sun: Array | None) -> float:
-        return _WALL if sun is None else 0.5 * _WALL  # a wall before the sun lies in its own shade
+        return _WALL if sun is None else 0.5 * _WALL  # with the sun behind it, a wall lies in its own shade
 
     def _lamps(self, at: Rays) -> Rays | float:
         """Return the light of the harbour's lamps at a point: one every 30 m, 6 m high."""
@@ -239,7 +240,7 @@ class Light:
             return  # behind the camera, or seen from behind
         flat = corners[:, :2] / corners[:, 2:]
         if (flat.max(axis=0) < self._low).any() or (flat.min(axis=0) > self._high).any():
-            return  # beside its view
+            return  # outside its view
         within = np.column_stack([np.clip(flat, self._low, self._high), np.ones(len(flat))])
         seen = project(self._camera, within)
         low = np.maximum(np.floor(seen.min(axis=0)).astype(int) - 1, 0)
@@ -287,7 +288,7 @@ class Light:
 
 
 def _print(tag: Tag, at_m: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Return whether points (N, 2) of a tag's plane lie on its plate, and the albedo there (N,)."""
+    """Return whether points (N, 2) of a tag's plane lie on its plate, and the albedo at them (N,)."""
     half, cell = 0.5 * PLATE * tag.size_m, tag.size_m / 8.0
     covered = (np.abs(at_m[:, 0]) < half) & (np.abs(at_m[:, 1]) < half)
     printed = np.pad(cells(tag.number), 1, constant_values=1)  # a tag within the white of its plate

@@ -50,7 +50,7 @@ _DATUM = Geodetic(57.7, 11.7, 36.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SimulatedRun:
-    """A run: measurements, truth, and the vessel.yaml that a careful engineer would write."""
+    """A simulated run: measurements, truth, and (`config`) the vessel.yaml that a careful engineer would write."""
 
     scenario: Scenario
     seed: int
@@ -64,7 +64,7 @@ class SimulatedRun:
 
 
 def simulate(scenario: Scenario, seed: int) -> SimulatedRun:
-    """Run a scenario. Deterministic for a seed."""
+    """Simulate a scenario; a seed always gives the same run."""
     rng = np.random.default_rng([seed, 7])
     harbour = load_harbour(scenario.harbour) if scenario.harbour else None
     rig = load_rig(scenario.rig)

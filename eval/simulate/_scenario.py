@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenarios: what happens in a run, those that have names, and changes to them."""
+"""Scenarios: what happens in a run; scenarios by name, and changes to them."""
 
 from __future__ import annotations
 
@@ -25,30 +25,32 @@ class Scenario:
     """What happens in a run. Defaults are BL's sensors and a calm harbour.
 
     Attributes:
-        path: in open water 'entry' (BL case 1), 'turn' (case 2), 'still' (case 3) or 'loops' (any length); in a
-            harbour how the vessel goes along its route: 'dock' comes to rest before its end, 'tour' halts on its way.
+        path: in open water 'entry' (BL case 1), 'turn' (case 2), 'still' (case 3) or 'loops' (any length). In a
+            harbour, how the vessel goes along its route: 'dock' comes to rest before the end, 'tour' halts on the way.
         case: BL case whose tables the GNSS noise follows.
         duration_s: length of the run. noise: kind of GNSS error.
         outage_s: (start, stop) without fixes and poses, or None.
         imu_hz, gnss_hz, compass_hz, pose_hz, log_hz: rates; 0 switches a sensor off. The log tells the speed ahead.
         gnss_sigma_m: white noise of each axis, 1 sigma; e / sqrt(2) with BL's e = 0.3 m.
-        gnss_reported_sigma_m: what the fixes claim for it, on average; 0: the truth.
-        gnss_reported_spread: how far the claims wander about that: 1 sigma of their logarithm.
-        pose_sigma_m, pose_sigma_deg: noise of a true match. false_fraction: share of false ones.
+        gnss_reported_sigma_m: sigma that the fixes state, on average; 0: the true one.
+        gnss_reported_spread: how far the stated sigmas wander about that: 1 sigma of their logarithm.
+        pose_sigma_m, pose_sigma_deg: noise of a right match. false_fraction: share of false matches.
         false_stays: probability that a false match repeats in the next scan.
-        pose_modes: modes of each match; the false ones lie around the right one.
-        gyro_bias_radps: size of the gyro bias (random direction); accel_bias_mps2: same.
-        log_sigma_mps: white. log_scale_error: share by which it reads too much. log_through: what it moves over or through.
+        pose_modes: number of modes of each match; the false ones lie around the right one.
+        gyro_noise_mdps_per_sqrt_hz, accel_noise_ug_per_sqrt_hz: white noise of the IMU.
+        gyro_bias_radps, accel_bias_mps2: sizes of the biases, whose directions are random.
+        log_sigma_mps: white noise of the log. log_scale_error: share by which it reads too much. log_through: whether
+            it measures the speed over ground or through the water.
         current_east_mps, current_north_mps: of the water.
-        compass_sigma_deg: white. compass_offset_deg: constant offset of the compass.
-        compass_until_s: the compass falls silent then. start_heading_error_deg: error of the start
-            heading written to the configuration; None writes none.
+        compass_sigma_deg: white noise of the compass. compass_offset_deg: its constant offset.
+        compass_until_s: when the compass falls silent. start_heading_error_deg: error of the start heading that is
+            written to the configuration; None: none is written.
         wave_roll_deg, wave_pitch_deg, wave_heave_m: RMS of the waves' motion.
         harbour: name or file of the harbour that the run lies in; empty: open water, `path` alone counts.
-        route: of the harbour. route_s: time that the vessel takes for all of it; a shorter run ends on the way.
-        tide_m: water over its mean. rig: name or file of what the vessel carries.
-        lidar_hz, camera_hz: scans of each LiDAR, images of each camera a second in the bag. condition: for cameras.
-        camera_raw: images as `sensor_msgs/Image`, ten times as large, not as JPEG.
+        route: of the harbour. route_s: time that the vessel takes for the whole route; a shorter run ends on the way.
+        tide_m: height of the water over its mean. rig: name or file of the vessel's equipment.
+        lidar_hz, camera_hz: scans of each LiDAR, and images of each camera, per second in the bag.
+        camera_raw: whether images are `sensor_msgs/Image`, ten times as large as JPEG. condition: for cameras.
     """
 
     path: Literal["entry", "turn", "still", "loops", "dock", "tour"] = "entry"
@@ -111,8 +113,8 @@ def bl_scenario(case: int, noise: GnssNoise) -> Scenario:
 def harbour_scenarios() -> dict[str, Scenario]:
     """Return the scenarios that lie in a harbour, by name.
 
-    BL's three cases under each kind of GNSS trouble; docking at a quay and at a floating dock in each of Digerud's
-    conditions while GNSS drifts; and half an hour through all of it.
+    They are BL's three cases with GNSS clean, drifting, jumping or out for a while; docking at a quay and at a floating
+    dock in each of Digerud's conditions while GNSS drifts; and a tour of half an hour.
     """
     found = {}
     for case, (harbour, route) in {1: ("marina", "entry"), 2: ("basin", "turn"), 3: ("marina", "still")}.items():
@@ -169,7 +171,7 @@ def _refuse_nonsense(s: Scenario) -> None:
     """Refuse values that no harbour has.
 
     Raises:
-        ConfigError: at the first of them.
+        ConfigError: a value is impossible; the first one is named.
     """
     numbers = {
         key: value for key in _FIELDS if isinstance(value := getattr(s, key), float) and key != "compass_until_s"
@@ -196,8 +198,8 @@ def _refuse_nonsense(s: Scenario) -> None:
 def _in_harbour(base: Scenario, **changes: object) -> Scenario:
     """Return a scenario with LiDARs and tide, and fixes as a receiver reports them.
 
-    Where GNSS errs, the receiver scatters by 5 cm from fix to fix and claims BL's 0.3 m. So the largest error of a drifting signal is
-    that of BL table 4.1, whose truth was the receiver itself.
+    Where GNSS errs, the receiver scatters by 5 cm from fix to fix and states BL's 0.3 m. So the largest error of a
+    drifting signal is that of BL table 4.1, whose truth was the receiver itself.
     """
     placed = replace(base, lidar_hz=1.0, tide_m=0.2, gnss_reported_spread=0.3, **changes)  # type: ignore[arg-type]
     if placed.noise == "clean":

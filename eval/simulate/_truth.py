@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """True motion: a planar path by profiles of speed and yaw rate, with waves and heel added.
 
-Velocity is a spline, position its integral and acceleration its derivative; attitude is analytic. So truth and inertial data
-agree to the accuracy of the arithmetic.
+Velocity is a spline, position its integral and acceleration its derivative; attitude is analytic. So truth and inertial
+data agree to the accuracy of the arithmetic.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from graphloc.frames import Array
 from graphloc.signals.series import integral
 
-_STEP_S = 0.02  # knots of the velocity spline
-_WAVES = 12  # sinusoids that stand for a sea
+_STEP_S = 0.02  # between knots of the velocity spline
+_WAVES = 12  # sinusoids that make up a sea
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Waves:
 
     @staticmethod
     def jonswap(rng: np.random.Generator, rms: float, peak_s: float) -> Waves:
-        """Draw waves whose sum has a standard deviation `rms`, spectrum JONSWAP (gamma 3.3), peak period in s."""
+        """Draw waves whose sum has standard deviation `rms` and a JONSWAP spectrum (gamma 3.3) with period `peak_s`."""
         peak = 2.0 * np.pi / peak_s
         omega = peak * np.sort(rng.uniform(0.6, 2.2, _WAVES))
         width = np.where(omega <= peak, 0.07, 0.09)
@@ -48,7 +48,7 @@ class Waves:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """The true motion as functions of t (s): see `state`."""
+    """The true motion, as functions of the time t (s)."""
 
     velocity: CubicSpline
     position: PPoly
@@ -62,7 +62,7 @@ class Motion:
     tide_m: float
 
     def attitude(self, t: Array) -> tuple[Array, Array]:
-        """Return rpy (N, 3) and their rates (N, 3), rad and rad/s."""
+        """Return roll, pitch and yaw (N, 3), rad, and their rates (N, 3), rad/s."""
         lean = -self.lean_per_mps2 * self.speed(t) * self.yaw_rate(t)
         lean_rate = -self.lean_per_mps2 * (self.speed(t, 1) * self.yaw_rate(t) + self.speed(t) * self.yaw_rate(t, 1))
         rpy = np.column_stack([self.roll.at(t) + lean, self.pitch.at(t), self.yaw(t)])
@@ -86,7 +86,7 @@ class Motion:
         )
 
     def inertial(self, t: Array, lever_m: Array, gravity_mps2: float) -> tuple[Array, Array]:
-        """Return specific force at `lever_m` and rate, (N, 3) each, in body axes."""
+        """Return specific force at the point `lever_m` of body, and angular rate, (N, 3) each, in body axes."""
         _, R, _ = self.pose(t)
         a = np.column_stack([self.velocity(t, 1), self.heave.at(t, 2)])
         a[:, 2] += gravity_mps2
@@ -136,7 +136,7 @@ def make_motion(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Way:
-    """A smooth path through waypoints, by its length (m): position (N, 2), heading (rad) and its change (rad/m)."""
+    """A smooth path through waypoints: heading (rad) as a function of the length (m) from its start."""
 
     length_m: float
     heading: CubicSpline
@@ -165,9 +165,10 @@ def make_way_motion(
     tide_m: float,
     swing: Waves,
 ) -> Motion:
-    """Build the motion along a path, from end to end in the given time; `slowing` (N,): shape of the speed.
+    """Build the motion along a path, from end to end in the given time.
 
-    The bow swings about the direction of the path by `swing`, rad.
+    Args:
+        slowing: shape of the speed over time. swing: rad, by which the bow swings about the direction of the path.
     """
     t = np.arange(-1.0, duration_s + 1.0 + _STEP_S, _STEP_S)
     shape = slowing(t)

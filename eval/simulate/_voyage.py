@@ -15,7 +15,7 @@ from graphloc.eval.simulate.harbour import Harbour
 from graphloc.eval.simulate.rig import RigConfig
 from graphloc.frames import Array
 
-_CLEAR_M = 0.4  # from the hull to anything solid
+_CLEAR_M = 0.4  # least distance from the hull to anything solid
 _LEAN_PER_MPS2 = 0.03  # rad of roll per m/s^2 across the vessel, in a turn
 _FASTEST_MPS = 15.0
 
@@ -63,7 +63,7 @@ def _waves(s: Scenario, rng: np.random.Generator) -> tuple[Waves, tuple[Waves, W
 
 
 def harbour_motion(s: Scenario, harbour: Harbour, rig: RigConfig, rng: np.random.Generator) -> Motion:
-    """Return the motion along the route from end to end, slower towards its end; or swaying about its only waypoint.
+    """Return the motion along the route from end to end, or swaying about the only waypoint of the route.
 
     Raises:
         ConfigError: the route collides with something.
@@ -101,7 +101,7 @@ def _way_motion(
     slowing: Callable[[Array], Array] = lambda t: 1.0 - 0.5 * _ramp(t, 0.8 * s.route_s, 8.0)
     swing = Waves(*np.zeros((3, 1)))
     if s.path in ("dock", "tour"):
-        swing = Waves.jonswap(rng, np.radians(1.0), 15.0)  # no helmsman holds a course to a hair
+        swing = Waves.jonswap(rng, np.radians(1.0), 15.0)  # no helmsman holds a course exactly
         shape = _docking if s.path == "dock" else _touring
         slowing = lambda t: shape(t / s.route_s)
     motion = make_way_motion(s.route_s, way, slowing, sway.at, waves, _LEAN_PER_MPS2, s.tide_m, swing)
@@ -122,12 +122,12 @@ def _refuse_collision(s: Scenario, harbour: Harbour, rig: RigConfig, motion: Mot
 
 
 def _docking(share: Array) -> Array:
-    """Return the shape of the speed of a vessel that decelerates steadily and lies still for the last sixth of its time."""
+    """Return the speed, up to scale, of a vessel that slows steadily and lies still for the last sixth of the time."""
     left = 1.0 - share / 0.83
     return 0.5 * (left + np.sqrt(left**2 + 0.001))
 
 
 def _touring(share: Array) -> Array:
-    """Return the shape of the speed of a tour: a stop of a twentieth of its time on the way, and docking at its end."""
+    """Return the speed, up to scale, of a tour: a stop of a twentieth of the time, and docking at the end."""
     halt = _ramp(share, 0.62, 0.004) - _ramp(share, 0.67, 0.004)
     return (1.0 - halt) * _docking(np.clip((share - 0.85) / 0.15, 0.0, None))

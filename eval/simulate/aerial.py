@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Aerial image of a harbour, as cluttered as a real one, written as GeoTIFF in UTM.
 
-Grid north of UTM differs from true north by the meridian convergence, so a reader has to handle that. The image is of another day
-than the run: other boats, season and sun; and it is misregistered by `shift_m`.
+Grid north of UTM differs from true north by the meridian convergence, which a reader has to handle. The image is of
+another day than the run, with other boats, season and sun, and it is misregistered by `shift_m`.
 """
 
 from __future__ import annotations
@@ -29,19 +29,24 @@ from graphloc.frames import Array, Datum
 Image = NDArray[np.uint8]
 Canvas = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-_FINE = 2  # drawn this much finer, then averaged: edges of a real image are not steps
-# Red, green, blue and how mottled each is.
+_FINE = 2  # factor by which the image is drawn finer, then averaged: edges of a real image are not steps
+# Red, green, blue, and amplitude of the grain of each surface.
 _SURFACES = {
     "concrete": ((168, 165, 158), 9.0), "asphalt": ((92, 94, 97), 7.0), "wood": ((139, 115, 88), 10.0),
     "grass": ((96, 116, 70), 14.0), "roof": ((126, 78, 66), 8.0), "stone": ((150, 147, 140), 16.0),
 }  # fmt: skip
 _WATER, _WATER_NOISE = (38, 62, 72), 6.0
 _KERB_M = 0.35
-_SHIFT_SIGMA_M = 0.3  # of the misregistration, east and north: the default of `image_sigma_m`: what a vessel.yaml states by default holds
+# 1 sigma of the misregistration, east and north: the default of `image_sigma_m`, so that this is true
+_SHIFT_SIGMA_M = 0.3
 
 
 class _Season(NamedTuple):
-    """Colour of grass and water, share of the boats that lie there, brightness, and how bare its light is."""
+    """A season.
+
+    Attributes:
+        grass, water: colours. boats: share of the boats that are afloat. light: brightness of the image.
+    """
 
     grass: tuple[int, int, int]
     water: tuple[int, int, int]
@@ -112,7 +117,7 @@ def _to_grid(epsg: int) -> Transformer:
 
 
 def render(harbour: Harbour, seed: int, pixel_m: float = 0.16) -> RenderedImage:
-    """Take the image of a harbour: its own day, sun, boats and misregistration, from `seed`."""
+    """Take the image of a harbour; day, sun, boats and misregistration are drawn from `seed`."""
     rng = np.random.default_rng([seed, 11])
     west, south, east, north = harbour.config.image_m
     epsg = utm_epsg(harbour.datum)
@@ -134,7 +139,10 @@ def render(harbour: Harbour, seed: int, pixel_m: float = 0.16) -> RenderedImage:
 
 
 def _averaged(canvas: Canvas) -> Canvas:
-    """Return the means of a canvas's blocks of `_FINE` by `_FINE` pixels: as `mean` over two axes, bit for bit, in a fifth of the time."""
+    """Return the means of a canvas's blocks of `_FINE` by `_FINE` pixels.
+
+    It equals `mean` over two axes bit for bit, in a fifth of the time.
+    """
     total = np.zeros_like(canvas[::_FINE, ::_FINE])
     for row in range(_FINE):
         for column in range(_FINE):
@@ -191,7 +199,7 @@ class _Pen:
         cv2.circle(self.canvas, p.tolist(), max(1, round(radius_m / self.pixel_m)), colour, -1, cv2.LINE_AA)
 
     def shade(self, outline_m: Array, by: Array, depth: float) -> None:
-        """Darken what lies in the shadow of an outline whose top is moved by `by` (2,) m."""
+        """Darken the shadow of an outline; `by`: (2,) m from the outline to the shadow of its top."""
         part, dark = self.window(np.asarray(outline_m) + np.linspace(0.0, 1.0, 12)[:, None, None] * by)
         part[dark] *= depth
 
@@ -200,14 +208,14 @@ class _Pen:
         rows, columns = part.shape[:2]
         if not inside.any():
             return
-        whole = inside.all()  # as water is: then nothing needs to be picked and put back
+        whole = inside.all()  # as for water: then no pixels have to be selected and written back
         painted = part if whole else part[inside]
         for size in sizes_m:
             step = max(1, round(size / self.pixel_m / 2))
             coarse = self._rng.normal(0.0, noise, (rows // step + 2, columns // step + 2)).astype(np.float32)
             grain = cv2.resize(coarse, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
             share = (grain if whole else grain[inside]) / len(sizes_m)
-            for channel in range(3):  # all at once, with three in the innermost loop, takes twice as long
+            for channel in range(3):  # all channels at once, three in the innermost loop, take twice as long
                 painted[..., channel] += share
         if not whole:
             part[inside] = painted
@@ -218,7 +226,7 @@ def _draw(pen: _Pen, harbour: Harbour, season: _Season, rng: np.random.Generator
     sun = slant * np.array([np.cos(azimuth), np.sin(azimuth)])  # a shadow's tip, per metre of height
     depth = float(rng.uniform(0.45, 0.65))
     ground: list[tuple[shapely.Polygon, Solid | Dock]] = [*harbour.quays, *harbour.pontoons]
-    for polygon, dock in harbour.docks:  # wherever it lay that day
+    for polygon, dock in harbour.docks:  # each where it lay on the day of the image
         moved = shapely.affinity.rotate(polygon, rng.uniform(-dock.moves_deg, dock.moves_deg))
         ground.append((shapely.affinity.translate(moved, *rng.uniform(-dock.moves_m, dock.moves_m, 2)), dock))
     for polygon, solid in ground:
@@ -229,7 +237,7 @@ def _draw(pen: _Pen, harbour: Harbour, season: _Season, rng: np.random.Generator
         part, inside = pen.fill(outline, season.grass if solid.surface == "grass" else colour, noise)
         around = part[~inside].copy()
         _joints_and_cars(pen, polygon, solid.surface, rng)
-        part[~inside] = around  # they end where it does
+        part[~inside] = around  # joints and cars end at the outline
         kerb = polygon.buffer(-0.5 * _KERB_M, join_style="mitre")  # its outer side is the wall's face
         for part_of_it in shapely.get_parts(kerb):
             for a, b in pairwise(np.array(part_of_it.exterior.coords)):

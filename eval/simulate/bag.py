@@ -40,7 +40,7 @@ _LATENCY_NS = {
     "/gnss/heading": 60_000_000,
     "/matcher/pose": 400_000_000,
 }
-_DRIVER_NS = 30_000_000  # after the turn of a LiDAR
+_DRIVER_NS = 30_000_000  # latency of a LiDAR's driver, from the end of a turn
 _IMAGE_LATENCY_NS = 80_000_000
 _TRUTH_HZ = 20.0
 _ALWAYS = QosTime(2147483647, 4294967295)
@@ -52,7 +52,7 @@ _CONFIG, _AERIAL, _TAGS, TRUTH = "vessel.yaml", "aerial.tif", "tags.yaml", "trut
 
 
 class _Item(NamedTuple):
-    """A message and when it was recorded."""
+    """A message: stamp of its recording, topic, type and content."""
 
     log_ns: int
     topic: str
@@ -71,9 +71,9 @@ def write_bag(
 ) -> tuple[Path, Path]:
     """Write `run` into `folder`; return the paths of the bag and of its vessel.yaml.
 
-    Header stamps are the sensors'; log stamps are later by each sensor's latency. A pose message holds one mode, the first. A run
-    in a harbour gets its aerial image and the survey of its tags, and scans and images if the scenario has them. These are rendered
-    while the bag is written, a few at a time, so memory does not grow with the run.
+    Header stamps are the sensors'; log stamps are later by each sensor's latency. A pose message holds one mode, the
+    first. A run in a harbour gets its aerial image and the survey of its tags, and scans and images if the scenario has
+    them. Scans and images are rendered while the bag is written, a few at a time, so memory does not grow with the run.
 
     Raises:
         OutputError: the folder exists, or cannot be written.
@@ -97,7 +97,7 @@ def _write(run: SimulatedRun, folder: Path, ros: int, storage: str, progress: Pr
     start, whole_s = _start_ns(run), round(run.scenario.duration_s)
     bag = folder / ("run.bag" if ros == 1 else "run")
     writing = Writer1(bag) if ros == 1 else Writer2(bag, version=9, storage_plugin=plugin)
-    # BLAS's own threads spin on our thin products: without them images cost half.
+    # BLAS's own threads spin on our small products: without them, images take half the time.
     with threadpool_limits(1, user_api="blas"), writing as writer:
         connections: dict[str, Any] = {}
         done_s = 0
@@ -148,7 +148,7 @@ def _beside(run: SimulatedRun, folder: Path) -> None:
 
 
 def _seen(run: SimulatedRun, make: Messages) -> list[Iterator[_Item]]:
-    """Yield scans and images, if the run has any."""
+    """Return iterators over scans and images, if the run has any."""
     lidars, cameras = _lidars(run), _cameras(run)
     if not (lidars or cameras):
         return []
@@ -209,7 +209,7 @@ def _images(run: SimulatedRun, make: Messages, scene: Scene, name: str) -> Itera
 
 
 def _small(run: SimulatedRun, make: Messages) -> list[_Item]:
-    """Yield all other messages, by recording time."""
+    """Return all messages but scans and images, by recording time."""
     items: list[_Item] = [_Item(_start_ns(run), "/tf_static", TF, make.mounts(_start_ns(run), _mounts(run)))]
 
     def add(stamp: int, topic: str, kind: str, message: Any) -> None:
@@ -232,7 +232,7 @@ def _small(run: SimulatedRun, make: Messages) -> list[_Item]:
 
 
 def _truth(run: SimulatedRun, make: Messages) -> Iterator[_Item]:
-    """Yield where the vessel is, and each dock, as odometry."""
+    """Yield the true poses of the vessel and of each dock, as odometry."""
     t = np.arange(round(run.scenario.duration_s * _TRUTH_HZ)) / _TRUTH_HZ
     stamps = (_start_ns(run) + np.rint(t * 1e9).astype(np.int64)).tolist()
     for stamp, p, R, v in zip(stamps, *run.motion.pose(t), strict=True):

@@ -15,7 +15,7 @@ from graphloc.eval.simulate.scene import Scene
 from graphloc.eval.simulate.weather import WEATHER
 from graphloc.frames import Array
 
-_SUN_OFF_DEG = 10.0  # how far the low sun stands beside the tags, 1 sigma
+_SUN_OFF_DEG = 10.0  # 1 sigma of the azimuth of the low sun about that of the tags
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,7 +23,7 @@ class Shot:
     """An image, with truth that only a simulator has.
 
     Attributes:
-        pixels: (rows, columns). exposure_ms, gain: of it. blur_px: motion during the exposure.
+        pixels: (rows, columns). exposure_ms, gain: of the image. blur_px: motion during the exposure.
     """
 
     pixels: Image

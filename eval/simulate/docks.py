@@ -12,8 +12,9 @@ from graphloc.eval.simulate._truth import Waves
 from graphloc.eval.simulate.harbour import Dock, Harbour, Tag
 from graphloc.frames import Array
 
-_HEAVE_M, _TILT_DEG, _CHOP_S = 0.02, 0.2, 4.0  # what the harbour's chop does to a heavy dock
-SURVEY_SIGMA_M, SURVEY_SIGMA_DEG = 0.01, 0.3  # a total station's, and a plate's on a wall
+# RMS heave and tilt of a heavy dock by the harbour's chop, and its period
+_HEAVE_M, _TILT_DEG, _CHOP_S = 0.02, 0.2, 4.0
+SURVEY_SIGMA_M, SURVEY_SIGMA_DEG = 0.01, 0.3  # errors of a total station, and of a plate mounted on a wall
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,8 +25,8 @@ class MovingDock:
     waterline.
 
     Attributes:
-        dock: its block. rest_m: (2,) its place at rest. tide_m: water over its mean. waves: of east, north, yaw,
-            heave, roll, pitch.
+        dock: its block in the harbour file. rest_m: (2,) its place at rest. tide_m: height of the water over its mean.
+        waves: of east, north, yaw, heave, roll, pitch.
     """
 
     dock: Dock
@@ -41,7 +42,7 @@ class MovingDock:
 
 
 def moving_docks(harbour: Harbour, tide_m: float, rng: np.random.Generator) -> tuple[MovingDock, ...]:
-    """Draw the motion of a harbour's docks; within four hours each wanders as far as its block states, and no farther."""
+    """Draw the motion of a harbour's docks; within four hours each wanders just as far as its block states."""
     t = np.arange(0.0, 4.0 * 3600.0, 0.5)
 
     def wander(size: float, period_s: float) -> Waves:
@@ -74,7 +75,7 @@ def tag_pose(tag: Tag, harbour: Harbour) -> tuple[Array, Array]:
 
 
 def survey(harbour: Harbour, rng: np.random.Generator) -> dict[str, object]:
-    """Return the survey, `tags.yaml`, with the errors of a surveyor."""
+    """Return the survey of the tags, for `tags.yaml`, with a surveyor's errors."""
     tags = []
     for tag in harbour.config.tags:
         p, R = tag_pose(tag, harbour)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """LiDARs in a harbour, ray-cast with Open3D.
 
-Each column of a scan is taken at its own time and vessel pose. Modelled are range noise, drop-outs, the vessel's own hull, and
-water, which returns little.
+Each column of a scan is taken at its own time and vessel pose. Modelled are range noise, drop-outs, the vessel's own
+hull, and water, which returns little.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class Scan:
     """One turn of one LiDAR.
 
     Attributes:
-        lidar: its name. t_s: time of the first column. points_m: (N, 3) in the sensor's axes, each at its own
-            time. dt_s: (N,) of that, since `t_s`. ring: (N,) beam. intensity: (N,), 0 to 255.
+        lidar: its name. t_s: time of the first column. points_m: (N, 3) in the sensor's axes at the time of each point.
+        dt_s: (N,) that time, since `t_s`. ring: (N,) beam. intensity: (N,), 0 to 255.
     """
 
     lidar: str
@@ -46,7 +46,7 @@ def scan(name: str, lidar: RigLidar, scene: Scene, motion: Motion, t_s: float, r
     origin = np.broadcast_to(T[:3, 3], in_body.shape)
     turned = R[columns]
     away, water = scene.ranges(origin, in_body, turned, p[columns], t_s + 0.5 * lidar.scan_s)
-    # Flat water throws the light away; what comes back does so from near and steep.
+    # Flat water reflects the light away from the sensor; only near and steep rays return.
     steep = np.abs(np.einsum("nj,nj->n", turned[:, 2], in_body))
     comes_back = rng.uniform(size=len(away)) > np.where(water, 1.0 - 0.3 * steep**2 * np.exp(-away / 12.0), lidar.drop)
     there = (away > 0.2) & (away < lidar.range_m) & comes_back
@@ -66,7 +66,7 @@ def scan(name: str, lidar: RigLidar, scene: Scene, motion: Motion, t_s: float, r
 def _rays(
     step_deg: float, lowest_deg: float, highest_deg: float, beams: int
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array]:
-    """Return azimuth (C,) rad of each column; column (N,), beam (N,) and direction (N, 3) of each ray, the same for each turn."""
+    """Return azimuth (C,) rad of each column; column (N,), beam (N,) and direction (N, 3) of each ray of a turn."""
     azimuth = np.radians(np.arange(0.0, 360.0, step_deg))
     elevation = np.radians(np.linspace(lowest_deg, highest_deg, beams))
     column = np.repeat(np.arange(len(azimuth)), beams)

@@ -19,7 +19,7 @@ _QUIET_DRIFT = 0.5  # 'a slight reduction of noise' beside the jump
 
 
 def drift_m(rng: np.random.Generator, t: Array, rmse_m: float) -> Array:
-    """Draw a horizontal drift (N, 2): it grows, levels out near 1.25 x its RMSE, and turns slowly."""
+    """Draw a horizontal drift (N, 2): it grows, levels out near 1.25 times its RMSE, and turns slowly."""
     span = float(np.ptp(t)) or 1.0
     size = 1.0 - np.exp(-(t - t[0]) / (span * rng.uniform(0.08, 0.2)))
     size = size + 0.08 * np.sin(2.0 * np.pi * (t - t[0]) / (span * rng.uniform(0.4, 0.8)) + rng.uniform(0, 6.28))
@@ -29,7 +29,7 @@ def drift_m(rng: np.random.Generator, t: Array, rmse_m: float) -> Array:
 
 
 def _varied_m(rng: np.random.Generator, t: Array, case: int) -> Array:
-    """Errors (N, 2) of a long run: clear sky, a drift that comes and goes, a jump, and a drift to the end."""
+    """Return the errors (N, 2) of a long run: clear sky, a drift that comes and goes, a jump, a drift to the end."""
     share, out = (t - t[0]) / (float(np.ptp(t)) or 1.0), np.zeros((len(t), 2))
     for begin, end, fades in ((0.2, 0.4, True), (0.6, 1.0, False)):
         (k,) = np.nonzero((share >= begin) & (share <= end))
@@ -43,7 +43,7 @@ def _varied_m(rng: np.random.Generator, t: Array, case: int) -> Array:
 
 
 def reported_sigma_m(rng: np.random.Generator, t: Array, sigma_m: float, spread: float) -> Array:
-    """Draw what fixes claim (N,), m: right on average (its mean square is `sigma_m` squared), wandering over 20 s."""
+    """Draw the sigmas (N,), m, that fixes state: their mean square is `sigma_m` squared, and they wander over 20 s."""
     log = np.zeros(len(t))
     step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
     keep = np.exp(-step / 20.0)
@@ -56,7 +56,7 @@ def reported_sigma_m(rng: np.random.Generator, t: Array, sigma_m: float, spread:
 
 
 def gnss_error_m(rng: np.random.Generator, t: Array, kind: GnssNoise, case: int, white_sigma_m: float) -> Array:
-    """Return the error (N, 3) of fixes at t (N,), white noise included; height drifts along at 1.5 times."""
+    """Return the error (N, 3) of fixes at t (N,), white noise included; height drifts 1.5 times as far as east."""
     error = rng.normal(0.0, white_sigma_m, (len(t), 3)) * np.array([1.0, 1.0, 2.0])
     if kind == "clean":
         return np.asarray(error)
@@ -78,7 +78,7 @@ def gnss_error_m(rng: np.random.Generator, t: Array, kind: GnssNoise, case: int,
         length = share * float(np.ptp(t))
         start = t[0] + rng.uniform(0.3, 0.7) * (float(np.ptp(t)) - length)
         during = (t >= start) & (t < start + length)
-        # Along the drift, give or take, so that the two add up to the table's largest error.
+        # About along the drift, so that jump and drift add up to the table's largest error.
         along = drift[int(np.argmax(during))]
         direction = float(np.arctan2(along[1], along[0])) + rng.normal(0.0, 0.3)
         error[during, :2] += height * np.array([np.cos(direction), np.sin(direction)])

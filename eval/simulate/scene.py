@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scene for ray casting on the day of the run: the harbour at its tide, that day's boats, moving docks, the vessel's hull."""
+"""Scene for ray casting on the day of a run: the harbour at its tide, boats, moving docks, the vessel's hull."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from graphloc.eval.simulate.rig import HullConfig
 from graphloc.frames import Array
 
 Rays = NDArray[np.float32]
-_SEABED_M = -4.0  # walls of quays reach down to here
+_SEABED_M = -4.0  # height down to which walls of quays reach
 
 
 class Hit(NamedTuple):
     """First hits of rays.
 
     Attributes:
-        range_m: (N,) in lengths of the ray; inf: no hit, and then the others are undefined.
+        range_m: (N,) in lengths of the ray's direction; inf: no hit, and the other values are undefined.
         surface: (N,) index into `Scene.surfaces`. normal: (N, 3) in world, of either sign.
     """
 
@@ -36,12 +36,17 @@ class Hit(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class _Part:
-    """Things that move together: Open3D's scene, and where its surfaces begin in the list of all."""
+    """Objects that move together.
+
+    Attributes:
+        rays: Open3D's scene of them. first: index of their first surface in the list of all. dock: which moves them;
+            None: they stand still. reach_m: largest distance of a point of them from their origin.
+    """
 
     rays: Any
     first: int
     dock: MovingDock | None = None
-    reach_m: float = np.inf  # no part of it is farther from its origin
+    reach_m: float = np.inf
 
 
 def scene_of(run: SimulatedRun) -> Scene:
@@ -60,14 +65,14 @@ class Scene:
     """A world to cast rays into.
 
     Attributes:
-        surfaces: what each surface is made of, by index. tide_m: height of the water. docks: those that move.
+        surfaces: material of each surface, by index. tide_m: height of the water. docks: the moving docks.
     """
 
     def __init__(
         self, harbour: Harbour, boats: tuple[Boat, ...], tide_m: float, docks: tuple[MovingDock, ...], hull: HullConfig
     ) -> None:
         try:
-            import open3d  # heavy: only who casts rays pays for it
+            import open3d  # heavy: imported only if rays are cast
         except (ImportError, OSError) as error:
             raise InputError(
                 f"open3d, which casts rays for LiDARs and cameras, cannot be loaded ({error}): `make` names the system "
@@ -137,7 +142,7 @@ class Scene:
         return found
 
     def water_range(self, height_m: Array | float, up: Array | Rays) -> Array:
-        """Return the range (N,) of the water, in lengths of the rays, inf if they miss it.
+        """Return the range (N,) of the water, in lengths of the rays' directions; inf: they miss it.
 
         Args:
             height_m: of the origins of rays in world. up: (N,) third component of their directions.
@@ -145,7 +150,7 @@ class Scene:
         return np.where(up < -1e-3, (self.tide_m - height_m) / np.minimum(up, -1e-3), np.inf)
 
     def own_range_m(self, origin_m: Rays, direction: Rays) -> Rays:
-        """Return the range (N,) of the vessel's hull along rays in body, inf if they miss it."""
+        """Return the range (N,) of the vessel's hull along rays in body; inf: they miss it."""
         return np.asarray(self._cast(self._own, origin_m, direction)["t_hit"].numpy())
 
     def _cast(self, scene: Any, origin_m: Rays, direction: Rays) -> Any:
@@ -156,11 +161,11 @@ class Scene:
     def ranges(
         self, origin_m: Array, direction: Array, R: Array, p_m: Array, t_s: float
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the range (N,), m, of rays, inf without a hit, and whether it is water (N,).
+        """Return the range (N,), m, of rays (inf: no hit), and whether they hit water (N,).
 
         Args:
-            origin_m, direction: (N, 3) in body. R: (N, 3, 3), p_m: (N, 3): body in world at each ray's time.
-            t_s: one time for the docks, which are slow.
+            origin_m, direction: (N, 3) in body. R, p_m: (N, 3, 3), (N, 3) pose of body in world at each ray's time.
+            t_s: time for the docks, the same for all rays, as docks are slow.
         """
         own = self.own_range_m(origin_m.astype(np.float32), direction.astype(np.float32))
         start = p_m + np.einsum("nij,nj->ni", R, origin_m)
@@ -172,7 +177,7 @@ class Scene:
 
 
 def _may_meet(origin_m: Rays, direction: Rays, middle_m: Rays, reach_m: float) -> NDArray[np.bool_]:
-    """Return which rays pass within `reach_m` of a point: others need not be cast."""
+    """Return which rays pass within `reach_m` of a point: the others need not be cast."""
     to = middle_m - origin_m
     along = direction @ to if to.ndim == 1 else np.einsum("ni,ni->n", direction, to)
     length2 = np.einsum("ni,ni->n", direction, direction)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Digerud's six conditions (D 3.4.4.2): what light there is, what the air and the lens do to it.
+"""Digerud's six conditions (D 3.4.4.2): the light, and what the air and the lens do to it.
 
-Light is counted in that of an overcast day: a white surface on the ground under it has radiance 1. Figures are
-chosen so that tags are lost near the ranges of D table 4.13; how near stands in docs/results.md.
+The unit of radiance is that of a white surface on the ground on an overcast day. Figures are chosen so that tags are
+lost near the ranges of D table 4.13; docs/results.md says how near.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ class Weather:
     """One condition.
 
     Attributes:
-        daylight: of the sky, 1 for an overcast day. fog_per_m: extinction of the air (Koschmieder).
-        sun_elevation_deg: of a low sun behind the tags; None: overcast. drops: water on the lens.
-        stray: stray light of the lens, times that of a clean one with the light behind it.
-        tag_glow: radiance of the white of a tag lit from behind. lamps: harbour lamps are on.
+        daylight: light of the sky; 1: an overcast day. fog_per_m: extinction of the air (Koschmieder).
+        sun_elevation_deg: of a low sun behind the tags; None: overcast. drops: whether there is water on the lens.
+        stray: factor on the stray light of a clean lens with the light behind it.
+        tag_glow: radiance of the white of a tag lit from behind. lamps: whether harbour lamps are on.
     """
 
     daylight: float = 1.0

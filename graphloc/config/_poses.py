@@ -70,7 +70,7 @@ class PoseSlowErrorConfig(Block):
 
     @model_validator(mode="after")
     def _of_some_size(self) -> PoseSlowErrorConfig:
-        usual = type(self).model_fields["time_constant_s"].default  # which an effective configuration states, too
+        usual = type(self).model_fields["time_constant_s"].default  # an effective configuration states it, too
         if self.time_constant_s != usual and self.sigma_m == self.sigma_deg == 0.0:
             raise ValueError("time_constant_s is of no error: set sigma_m or sigma_deg, too, or delete it")
         return self

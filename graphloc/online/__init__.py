@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The online mode: measurements in, in the order they arrive; a pose out, at once."""
+"""The online mode: takes measurements in the order of their arrival, and returns a pose at once."""
 
 from graphloc.online._smoother import OnlineSmoother
 

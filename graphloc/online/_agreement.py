@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Agreement of the absolute sensors with the estimate: when each last agreed, and for how long none has."""
+"""Agreement of the absolute sensors with the estimate: when each agreed last, and for how long all have disagreed."""
 
 from __future__ import annotations
 
@@ -16,21 +16,24 @@ from graphloc.signals.position_jumps import MEAN_S
 from graphloc.solve.decide import AGREES, CREDIBLE, Verdict, far_sigmas
 from graphloc.solve.health import FAR_OFF
 
-_FEW = 8  # absolute measurements in a row must disagree; fewer are no sign
-# Of disagreement, until the estimate is lost; measurements of one sensor in a row that must disagree.
+_FEW = 8  # absolute measurements that must disagree before the estimate may be lost
+# Disagreement (s) after which the estimate is lost; measurements of one sensor that must disagree in a row by then.
 _LOST_S, _DENIES = 15.0, 3
-_JUMPED_S = (60.0, 200.0)  # the longest a jump lasts: after a short, and after a long time at the level before it
-_BENT_S = 20.0  # without a position, dead reckoning is as far off as a slow error
-# Of a receiver beside matches: for how long, s, it must have agreed by a slow error of so many sigmas before they are taken to be
-# right where it is far off; how old, s, the newest match may be.
+_JUMPED_S = (60.0, 200.0)  # longest duration of a jump, after a short and after a long time at the level before it
+_BENT_S = 20.0  # after so long without a position, dead reckoning may be as far off as a slow error
+# Matches are believed against a receiver that is far off once a receiver has agreed beside them for so long (s), by a
+# slow error of at most so many sigmas. "Beside" means that the newest match that agreed is at most so old (s).
 _CONFIRMS_S, _CONFIRMS, _BESIDE_S = 15.0, 2.0, 5.0
 
 
 class _Standing(NamedTuple):
-    """How a sensor agreed last: when, and whether only by a slow error that is unlikely so large.
+    """How a sensor stands to the estimate.
 
     Attributes:
-        confirmed_s: for how long it has agreed by a usual one while matches did. doubted: whether it was ever far off beside them.
+        stamp_ns: stamp of its last measurement that agreed. far: whether that agreed only by an unlikely large slow
+            error.
+        confirmed_s: for how long it has agreed by a slow error of usual size while matches agreed, too.
+        doubted: whether it ever agreed only by an unlikely large slow error while matches agreed.
     """
 
     stamp_ns: int = 0
@@ -39,8 +42,12 @@ class _Standing(NamedTuple):
     doubted: bool = False
 
     def then(self, stamp_ns: int, far_sigmas: float, beside: bool) -> _Standing:
-        """Return how it stands after it has agreed again, by a slow error of so many sigmas; beside: whether matches agree, too."""
-        if stamp_ns <= self.stamp_ns:  # older ones are judged again after newer ones
+        """Return how the sensor stands after a further measurement that agrees.
+
+        Args:
+            far_sigmas: size of the slow error by which it agrees, in sigmas. beside: whether matches agree, too.
+        """
+        if stamp_ns <= self.stamp_ns:  # an older measurement, judged again after newer ones
             return self
         since_s = min((stamp_ns - self.stamp_ns) * 1e-9, 1.0)
         confirmed_s = self.confirmed_s + (since_s if beside and far_sigmas <= _CONFIRMS else 0.0)
@@ -61,12 +68,13 @@ class Agreement:
         self.agreed_ns: dict[str, int] = {}
         self._standing: dict[str, _Standing] = {}
         self._matched_ns = 0  # stamp of the newest match that agreed
-        # Stamps of the first few absolute measurements that disagreed since the last that agreed.
+        # Stamps of the first few absolute measurements that disagreed since the last one that agreed.
         self._refused: list[int] = []
-        self._denied: dict[str, int] = {}  # by sensor: how many in a row disagreed, whatever slow error is allowed
-        self._usual_ns: tuple[int, int] | None = None  # first and last stamp at the usual level
-        self._jumped_ns: int | None = None  # since when sensors agree only by a jump
-        self._told_ns = 0  # stamp of the last one that agreed, by whatever level
+        self._denied: dict[str, int] = {}  # by sensor: measurements in a row that disagreed in spite of any slow error
+        # First and last stamp at which a sensor agreed by a usual slow error
+        self._usual_ns: tuple[int, int] | None = None
+        self._jumped_ns: int | None = None  # since when sensors agree only by a slow error that has jumped
+        self._told_ns = 0  # stamp of the last measurement that agreed, by a slow error of any size
 
     def note(self, stream: LiveStream, m: Measurement, verdict: Verdict | None) -> None:
         """Note how a measurement was judged; verdict None: it was rejected without being judged."""
@@ -76,11 +84,12 @@ class Agreement:
         self._denied[stream.name] = 0 if agrees else self._denied.get(stream.name, 0) + 1
         if verdict is not None and agrees:
             far = far_sigmas(stream.slow, verdict.at)
-            # Farther off, the level that it jumped from may be the wrong one.
+            # With a larger slow error, the level before the jump may be the wrong one instead.
             self._note_level(m.stamp_ns, usual=far <= FAR_OFF)
             if stream.row.false is not None and stream.row.false(m, stream.config).news < 1.0:
                 self._matched_ns = max(self._matched_ns, m.stamp_ns)
-            # Sensors without an error that may jump tell nothing of matches, least of all these themselves.
+            # Sensors without an error that may jump neither confirm nor contradict matches; matches themselves are
+            # among them.
             jumps = stream.slow is not None and bool(stream.slow.far_axes.any())
             beside = jumps and abs(m.stamp_ns - self._matched_ns) < _BESIDE_S * 1e9
             self._standing[stream.name] = self._standing.get(stream.name, _Standing()).then(m.stamp_ns, far, beside)
@@ -94,7 +103,8 @@ class Agreement:
 
     def _note_level(self, stamp_ns: int, *, usual: bool) -> None:
         if stamp_ns - self._told_ns > _BENT_S * 1e9 and self._jumped_ns is None:
-            # The estimate follows what comes now, at whatever level: how long one had been held before says nothing of that.
+            # After such an outage the estimate follows any level: how long one was held before does not make it the
+            # usual one.
             self._usual_ns = None
         if usual:
             self._usual_ns = (self._usual_ns or (stamp_ns, stamp_ns))[0], stamp_ns
@@ -104,21 +114,22 @@ class Agreement:
         self._told_ns = max(stamp_ns, self._told_ns)
 
     def forget_refused(self) -> None:
-        """Forget disagreement: a receiver turned out to be frozen, so it is no evidence against the estimate."""
+        """Forget disagreement, which is no evidence against the estimate: a receiver turned out to be frozen."""
         self._refused = []
         self._denied.clear()
         self._jumped_ns = None
 
     def unlikely(self, receiver_of: Callable[[str], str]) -> list[str]:
-        """Return the sensors whose newest measurement that agrees does so only by a slow error which is unlikely so large.
+        """Return the sensors whose newest measurement that agrees does so only by an unlikely large slow error.
 
         Args:
-            receiver_of: the name of a sensor's receiver (`VesselConfig.receiver_of`): of those that read one by turns the newest counts.
+            receiver_of: gives the name of a sensor's receiver (`VesselConfig.receiver_of`). Of sensors that read one
+                receiver by turns, only the one that agreed last counts.
         """
         return sorted(name for standing, name in self._newest(receiver_of) if standing.far)
 
     def doubted(self, receiver_of: Callable[[str], str]) -> list[str]:
-        """Return the sensors that have been far off beside matches which no receiver has agreed with for long: either may be wrong.
+        """Return the receivers that have been far off beside matches that no receiver confirms: either may be wrong.
 
         Args:
             receiver_of: as for `unlikely`.
@@ -135,21 +146,21 @@ class Agreement:
         return list(newest.values())
 
     def marked(self) -> _Mark:
-        """Return the state, for `back_to`."""
+        """Return all that is noted, for `back_to`."""
         levels = self._usual_ns, self._jumped_ns, self._told_ns, self._matched_ns
         return dict(self.agreed_ns), dict(self._standing), list(self._refused), dict(self._denied), *levels
 
     def back_to(self, mark: _Mark) -> None:
-        """Forget what was noted since `marked`: it agreed with choices that were given up."""
+        """Forget what was noted since `marked`: it was judged under choices of modes that were given up."""
         self.agreed_ns, self._standing, self._refused, self._denied = mark[:4]
         self._usual_ns, self._jumped_ns, self._told_ns, self._matched_ns = mark[4:]
 
     def inherit(self, before: Agreement) -> None:
-        """Take over when each sensor last agreed, and since when one has been at its usual or another level.
+        """Take over when each sensor last agreed, and since when the usual level or a jump has been held.
 
         Args:
-            before: of the window replaced. What is in this window will be noted anew, but a level that has been held for longer
-                would seem to begin with it.
+            before: that of the window that is replaced. Measurements in the new window are noted anew; without this, a
+                level that was held before it would seem to begin with it.
         """
         self.agreed_ns.update(before.agreed_ns)
         self._standing = self._standing | before._standing
@@ -160,9 +171,9 @@ class Agreement:
             self._jumped_ns = before._jumped_ns
 
     def wrong_level(self, now_ns: int) -> float:
-        """Return the probability that what is taken for a jump is its end: the level before it was the wrong one.
+        """Return the probability that the present jump is in truth the end of one: the level before it was wrong.
 
-        By how long either has been held, as jumps last `MEAN_S` on average.
+        It follows from how long each level has been held, as jumps last `MEAN_S` on average.
         """
         if self._jumped_ns is None:
             return 0.0
@@ -171,10 +182,10 @@ class Agreement:
         return float(expit(-longer_s / MEAN_S))
 
     def lost_s(self, now_ns: int) -> float:
-        """Return for how long (s) the absolute sensors have disagreed with the estimate; 0 where that is too short to call it lost.
+        """Return for how long (s) the absolute sensors have disagreed with the estimate; 0 while it is not lost.
 
-        Where they agree, but only by a slow error that has jumped, the estimate is taken to be right for as long as jumps last:
-        the longer the level before was held, the longer.
+        If they agree, but only by a slow error that has jumped, the estimate counts as right for as long as a jump may
+        last. That is longer, the longer the level before the jump was held (`_JUMPED_S`).
         """
         seconds = self._timeline.seconds
         if len(self._refused) >= _FEW and any(in_a_row >= _DENIES for in_a_row in self._denied.values()):
@@ -194,7 +205,7 @@ _Mark = tuple[
 
 
 def _credible(stream: LiveStream, at: Attachment) -> bool:
-    """Whether a sensor agrees by a slow error of plausible size."""
+    """Return whether the slow error by which a sensor agrees is of plausible size."""
     if stream.slow is None or at.slow_value is None:
         return True
     return bool((np.abs(at.slow_value) <= CREDIBLE * stream.slow.sigma).all())

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which of the newest measurements of a sensor are right: all choices, with their probabilities.
 
-One choice is in the graph, and it confirms itself: two false matches that agree pull the estimate to themselves. But near the
-estimate the graph is linear. So the joint covariance gives the estimate without any of these measurements (they are removed),
-the estimate with any other choice, and the probability of that choice. The most probable one is then tried in the graph; the
-spread of the others adds to the covariance of the position.
+The choice that is in the graph confirms itself: two false matches that agree pull the estimate towards themselves. But
+near the estimate the graph is linear. So the joint covariance gives the estimate without any of these measurements, the
+estimate with any other choice of them, and the probability of each choice. The most probable choice is then tried in
+the graph; the spread of the others is added to the covariance of the position.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from graphloc.solve.hypotheses import log_false_again, log_right_and_false
 from graphloc.solve.prediction import taken_of
 
 _MOST, _LEAST = 16, 12.0  # choices that are kept; log probability (nats) below the best at which one is dropped
-# Least eigenvalue of what remains when a measurement is removed, as a share of its own information. Its factor was linearised
-# a moment ago at another pose, so the difference may come out negative by a hundredth or so.
+# Smallest eigenvalue of the information that remains when measurements are removed, as a share of their own. Their
+# factors were linearised a moment ago at another pose, so the difference may come out negative by a hundredth or so.
 _LOOSEST = 1e-3
-# Below this one it tells how loose the rest leaves that direction, and not where: a residual of 3 cm would move the estimate by 30 m.
+# With a smaller eigenvalue, it is known how uncertain the estimate is along that direction without the measurements,
+# but not where it lies: a residual of 3 cm would move it by 30 m.
 _TELLS = 0.03
 
 
@@ -35,9 +36,10 @@ class Choice:
     """One choice of modes.
 
     Attributes:
-        log: log of its probability. modes: of N measurements, the mode that is right; None: the measurement is false.
+        log: log of its probability. modes: mode that is right, of each of N measurements; None: the measurement is
+            false.
         step: (d,) from the present estimate to that of this choice: position first (m, world), then each residual.
-        cov: (d, d), its covariance.
+        cov: (d, d), covariance of the estimate of this choice, in the same order.
     """
 
     log: float
@@ -55,12 +57,13 @@ def choices(
 ) -> tuple[list[Choice], bool]:
     """Return the choices among N measurements of a stream, the most probable first, and whether they are unplaced.
 
-    Unplaced: along some direction a choice is known only by that how far off its mean may be.
+    Unplaced means: along some direction the covariances of the choices are known, but their means are not (see
+    `_TELLS`).
 
     Args:
         indices: of the measurements. residuals: N tuples, one residual per mode.
         cov: (d, d), joint covariance of the position and all residuals, from the graph as it is.
-        held: N modes and weights with which they are in the graph, or None.
+        held: mode and weight with which each measurement is in the graph; None: it is not.
     """
     _, models = taken_of(stream, indices)
     ends = np.cumsum([0, *(len(found[0].raw) for found in residuals)])
@@ -75,7 +78,7 @@ def choices(
             for mode, r in enumerate(seen):
                 gain = np.linalg.solve(r.cov + P, c.cov[at[n]]).T
                 step, cov = c.step - gain @ r.raw, c.cov - gain @ c.cov[at[n]]
-                nis = r.nis(P)  # in full: it says whether they agree, not how well the modes look
+                nis = r.nis(P)  # not scaled by `news`: it says whether the measurements agree, not how well modes look
                 log_right = model.news * (r.log_density(P) + 0.5 * nis) - 0.5 * nis
                 grown.append(Choice(c.log + log_right, (*c.modes, mode), step, cov))
             log = log_right_and_false(seen, P, model)[1]
@@ -95,14 +98,19 @@ def choices(
 def _without(
     residuals: Sequence[tuple[Residual, ...]], cov: Array, held: Sequence[tuple[int, float] | None], at: list[slice]
 ) -> tuple[Array, Array, bool]:
-    """Return step and covariance, as in `Choice`, and whether it is unplaced, after removing all of the measurements from the graph."""
+    """Return the estimate after removing all of the measurements from the graph.
+
+    Returns:
+        Its step and covariance as in `Choice`, and whether it is unplaced (see `choices`).
+    """
     there = [(n, *h) for n, h in enumerate(held) if h is not None]
     if not there:
         return np.zeros(len(cov)), cov, False
     rows = np.concatenate([np.arange(len(cov))[at[n]] for n, _, _ in there])
     raw = np.concatenate([residuals[n][mode].raw for n, mode, _ in there])
     root = block_diag(*(np.linalg.cholesky(residuals[n][mode].cov / weight) for n, mode, weight in there))
-    # Inverse of the innovation covariance of the removal.
+    # Whitened by the measurements' noise; `values` are the eigenvalues of the information that is left, as a share of
+    # theirs.
     inverse = np.linalg.inv(root)
     values, vectors = np.linalg.eigh(np.eye(len(rows)) - inverse @ cov[np.ix_(rows, rows)] @ inverse.T)
     told = values > _TELLS

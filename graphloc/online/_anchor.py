@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The estimate at one state, to continue from: after the start, after a failure of the solver, after a kill.
+"""The estimate at one state, to continue from: after the start, after a solver's failure, after a killed process.
 
-Kept are the joint Gaussian of pose, velocity and bias, and that of each slow state, and of each constant in the window, conditional
-on these: the slow error of a receiver is correlated with the position, and so is the place of its antenna. Independent of the position,
-that place would be told by the next fix again, from the same prior: a vessel that lay still was so sure of its position to 0.24
-instead of 0.54 m after five restarts, and 1.1 m off.
+It holds the joint Gaussian of pose, velocity and bias. It also holds the Gaussian of each slow state, and of each
+constant in the window, conditional on pose, velocity and bias: the slow error of a receiver is correlated with the
+position, and so is the place of its antenna. If that place were kept independent of the position, each next fix would
+tell it anew from the same prior. After five restarts the position of a vessel that lay still then had a sigma of 0.24 m
+instead of 0.54 m, and was 1.1 m off.
 """
 
 from __future__ import annotations
@@ -29,11 +30,12 @@ _PARTS = (slice(0, 6), slice(6, 9), slice(9, _CORE))
 class ConditionalGaussian:
     """A vector conditional on a state: its mean is value + gain * (state - anchor), its covariance cov.
 
-    Conditional on the pose alone, all that later data say of the velocity would move the vector together with the position: after
-    a second of data a tide (0.5 m, 1 sigma) was so known to 0.47 m, and 0.12 m off, by nothing but the heave of that second.
+    The condition includes velocity and bias. With the pose alone, all that later data say of the velocity would move
+    the vector together with the position: after a second of data, the sigma of a tide fell from 0.5 m to 0.47 m, and
+    the tide was 0.12 m off, only because the vessel heaved in that second.
 
     Attributes:
-        value: (k,). gain: (k, 15) by pose (tangent), velocity and bias. cov: (k, k).
+        value: (k,), mean at the anchor. gain: (k, 15) by pose (tangent), velocity and bias. cov: (k, k).
     """
 
     value: Array
@@ -42,12 +44,12 @@ class ConditionalGaussian:
 
     @classmethod
     def independent(cls, value: Array, cov: Array) -> ConditionalGaussian:
-        """Return a vector that is independent of the state."""
+        """Return the Gaussian of a vector that is independent of the state."""
         return cls(value=value, gain=np.zeros((len(value), _CORE)), cov=cov)
 
 
 def in_world(pose: Any) -> Array:
-    """Return the rotation (15, 15) of pose, velocity and bias from the tangent at a pose (body axes) to the axes of world."""
+    """Return the rotation (15, 15) of pose, velocity and bias from the body tangent of a pose to axes of world."""
     turn = np.eye(_CORE)
     turn[:3, :3] = turn[3:6, 3:6] = pose.rotation().matrix()
     return turn
@@ -60,10 +62,12 @@ class Anchor:
     Attributes:
         stamp_ns: of the state. pose: gtsam.Pose3 at the IMU with the body's axes, in world. velocity: (3,), in world.
         bias: (6,), accelerometer first.
-        step: (15,) from there to the mean: pose (body tangent, rotation first), velocity, bias. It is kept apart from the point of
-            linearisation: written about the mean, which may lie tens of degrees off, a start would not stay at its solution.
-        cov: (15, 15), in the same order. level: levelling factor of a start; a snapshot has none.
-        slow: by sensor. constants: by sensor and number.
+        cov: (15, 15) of pose (body tangent, rotation first), velocity and bias.
+        step: (15,) from pose, velocity and bias above, where the Gaussian is linearised, to its mean, in the order of
+            `cov`. The mean may lie tens of degrees away; if a start were linearised there, it would not stay at its
+            solution.
+        slow: slow states, by sensor. constants: by sensor and number. level: levelling factor of a start; None: there
+            is none, as in a snapshot.
     """
 
     stamp_ns: int
@@ -78,7 +82,7 @@ class Anchor:
 
     @classmethod
     def of_start(cls, stamp_ns: int, prior: StartPrior) -> Anchor:
-        """Return the prior of a start; slow states have none."""
+        """Return the anchor of a start's prior; it has no slow states."""
         cov = np.zeros((_CORE, _CORE))
         cov[:6, :6], cov[6:9, 6:9], cov[9:, 9:] = prior.pose_cov, prior.velocity_cov, prior.bias_cov
         bias = np.concatenate([prior.bias.accelerometer(), prior.bias.gyroscope()])
@@ -86,7 +90,7 @@ class Anchor:
         return cls(stamp_ns=stamp_ns, pose=prior.pose, velocity=velocity, bias=bias, cov=cov, level=prior.level)
 
     def widened(self, times: float) -> Anchor:
-        """Return it with covariances so many times as large: it was estimated with too little noise."""
+        """Return the anchor with covariances `times` as large: it was estimated with too little noise."""
         slow = {name: replace(known, cov=known.cov * times) for name, known in self.slow.items()}
         constants = {of: replace(known, cov=known.cov * times) for of, known in self.constants.items()}
         return replace(self, cov=self.cov * times, slow=slow, constants=constants)
@@ -104,9 +108,9 @@ class Anchor:
         """Return the anchor of a joint Gaussian.
 
         Args:
-            point: pose, velocity, bias (6,) that it is written about.
-            mean: (n,) step from there (15,), and then the values of the slow states and constants, in turn.
-            cov: (n, n), likewise. slow, constants: how many rows each has.
+            stamp_ns: of the state. point: pose, velocity (3,) and bias (6,) at which the Gaussian is linearised.
+            mean: (n,) step (15,) from `point` to the mean, then the values of the slow states and of the constants.
+            cov: (n, n), in the same order. slow, constants: number of rows of each, by sensor, or by sensor and number.
         """
         ends = np.cumsum([_CORE, *slow.values(), *constants.values()])
         own = [np.arange(a, b) for a, b in pairwise(ends)]
@@ -129,7 +133,7 @@ class Anchor:
         """Return the anchor at state `k` of a solved run, from all data before it.
 
         Raises:
-            numpy.linalg.LinAlgError: they do not determine the state.
+            numpy.linalg.LinAlgError: the data do not determine the state.
         """
         j = int(problem.timeline.slow_of[k])
         slow = {s.name: keys.slow(s.number, j) for s in problem.streams if s.slow is not None}
@@ -165,7 +169,13 @@ class Anchor:
         )
 
     def factors(self, pose: int, velocity: int, bias: int) -> list[Any]:
-        """Return the prior factors of the state, by its keys; linear in world, as in `conditional_factor`."""
+        """Return the prior factors of the state.
+
+        They are linear in the axes of world (reason: `conditional_factor`).
+
+        Args:
+            pose, velocity, bias: keys of the state.
+        """
         turn = in_world(self.pose)
         whiten, mean = gauss.whitening(sound(turn @ self.cov @ turn.T)), turn @ self.step
 
@@ -180,11 +190,14 @@ class Anchor:
         return found if self.level is None else [*found, _upright(self.level, pose, bias)]
 
     def conditional_factor(self, known: ConditionalGaussian, state: Sequence[int], key: int) -> Any:
-        """Return the factor of a vector conditional on the state (keys of its pose, velocity and bias).
+        """Return the factor of a vector conditional on the state.
 
-        Linear in the axes of world: position and slow error may each be hardly known, but their sum to centimetres. In the body
-        tangent of a heading that is later corrected by 20 deg the factor would state another sum, and both sums together would
-        determine the position.
+        It is linear in the axes of world. Position and slow error may each be hardly known, while their sum is known to
+        centimetres. If the factor were linear in the body tangent, and the heading later corrected by 20 deg, it would
+        constrain another sum; two different sums together would determine the position.
+
+        Args:
+            known: the vector. state: keys of the pose, velocity and bias. key: of the vector.
         """
         whiten = gauss.whitening(sound(known.cov))
         gain = whiten @ known.gain @ in_world(self.pose).T
@@ -201,7 +214,7 @@ class Anchor:
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(known.value)), [*state, key], error)
 
     def _off(self, state: Sequence[int], values: gtsam.Values) -> tuple[Array, tuple[Array, ...]]:
-        """Return the difference of a state from this one (15,), in the axes of world, and the Jacobians of its three parts."""
+        """Return the difference (15,) of a state from this one, in axes of world, and its Jacobians by the 3 parts."""
         pose, velocity, bias = state
         R, p = values.atPose3(pose).rotation(), values.atPose3(pose).translation()
         turned = gtsam.Rot3.Logmap(R.compose(self.pose.rotation().inverse()))
@@ -210,7 +223,7 @@ class Anchor:
         return off, (np.asarray(np.kron(np.eye(2), R.matrix()), dtype=np.float64), np.eye(3), np.eye(6))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain data."""
+        """Return the anchor as plain data, for JSON; without `level`."""
         return {
             "stamp_ns": self.stamp_ns,
             "pose": self.pose.matrix().tolist(),
@@ -224,10 +237,10 @@ class Anchor:
 
     @classmethod
     def from_dict(cls, raw: Mapping[str, Any]) -> Anchor:
-        """Read plain data.
+        """Read an anchor from plain data.
 
         Raises:
-            KeyError, TypeError, ValueError: it is damaged.
+            KeyError, TypeError, ValueError: the data are damaged.
         """
         matrix = _array(raw["pose"], (4, 4))
         return cls(
@@ -243,7 +256,7 @@ class Anchor:
 
 
 def _upright(level: Level, pose: int, bias: int) -> Any:
-    """Return the factor of a levelling."""
+    """Return the factor of a levelling on a pose and a bias (keys)."""
 
     def error(this: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
         own, held = this.keys()
@@ -259,7 +272,7 @@ def _upright(level: Level, pose: int, bias: int) -> Any:
 
 
 def _conditional(mean: Array, joint: Array) -> ConditionalGaussian:
-    """Return the vector conditional on the state, from the joint Gaussian (15 + k,) of the state's step and the vector."""
+    """Return a vector conditional on the state, from the joint Gaussian (15 + k,) of the state's step and it."""
     gain = np.linalg.solve(sound(joint[:_CORE, :_CORE]), joint[:_CORE, _CORE:]).T
     cov = joint[_CORE:, _CORE:] - gain @ joint[:_CORE, _CORE:]
     value = mean[_CORE:] - gain @ mean[:_CORE]
@@ -267,9 +280,13 @@ def _conditional(mean: Array, joint: Array) -> ConditionalGaussian:
 
 
 def without_priors(mean: Array, cov: Array, variance: Array) -> tuple[Array, Array]:
-    """Return mean (n,) and covariance (n, n) after removing independent priors of mean 0 and variance (n,); inf: there is none.
+    """Return mean (n,) and covariance (n, n) after removing independent priors of mean 0.
 
-    Such a prior closes a slow chain at its end, or may be weighed otherwise later. Kept in an anchor, it would count again.
+    Such a prior closes a slow chain at its end, or may get another weight later. If it stayed in an anchor, it would
+    count twice.
+
+    Args:
+        mean, cov: with the priors. variance: (n,) of the priors; inf: there is none.
     """
     rows = np.flatnonzero(np.isfinite(variance))
     variance = variance[rows]
@@ -278,7 +295,7 @@ def without_priors(mean: Array, cov: Array, variance: Array) -> tuple[Array, Arr
 
 
 def sound(cov: Array) -> Array:
-    """Return the covariance made symmetric and positive definite, where rounding has spoiled that."""
+    """Return a covariance made symmetric and positive definite again, where rounding has spoiled that."""
     whole = 0.5 * (cov + cov.T)
     scale = np.sqrt(np.maximum(np.diagonal(whole), 1e-18))
     values, vectors = np.linalg.eigh(whole / np.outer(scale, scale))

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Walk of the IMU's biases: raised where they go farther than they were known and may have walked since (offline: `solve/bias_walk.py`).
+"""Walk of the IMU's biases (offline: `solve/bias_walk.py`).
 
-Lowered again where they have gone clearly less far for minutes: an IMU that warms up is warm some time.
+The walk is raised where a bias changes by more than its covariance and its configured walk allow. It is lowered again
+where the biases have changed clearly less for minutes, as when an IMU has warmed up.
 """
 
 from __future__ import annotations
@@ -17,22 +18,24 @@ from graphloc.measurements import ImuSeries
 from graphloc.online._lag import Lag
 from graphloc.solve.bias_walk import MOST_TIMES, WALK_KEYS, KnownBias, too_steady, went_too_far
 
-_EVERY_S = 10.0
-_RAISED_BY = 6  # of these: a minute; a bias that creeps shows after the longest
-_LOWERED_BY = 90  # of these: a quarter of an hour
-_CLEAR = 4.0  # variances of a bias that its walk must exceed: else how it goes is what the filter makes of noise
-_TOO_LITTLE = 1e-5  # probability; lowered too far by chance it is raised again
-_AT_MOST = 0.95  # confidence that the bias walks no more than what is taken then
-_LEAST_LESS = 0.8  # of the walk; a smaller change is not worth a window that is built anew
-# 1 sigma: from which the heading turns the biases of accelerometers with it, by more than their covariance tells.
+_EVERY_S = 10.0  # between two looks at the biases
+_RAISED_BY = 6  # looks by which the walk is raised: a minute. A bias that creeps shows only over the whole of it
+_LOWERED_BY = 90  # looks by which the walk is lowered: a quarter of an hour
+_CLEAR = 4.0  # variances of a bias that its walk over a step must exceed: else its change is noise of the estimate
+# Probability of so little change, below which the walk is lowered; too low by chance, it is raised again
+_TOO_LITTLE = 1e-5
+_AT_MOST = 0.95  # confidence that the biases walk no more than the lowered walk says
+_LEAST_LESS = 0.8  # share of the walk above which it is not lowered: the change is not worth building the window anew
+# 1 sigma of the heading: above it, corrections of the heading change the accelerometer biases by more than their
+# covariance tells.
 _HEADING_RAD = 0.1
 
 
 class BiasWalk:
-    """Factors on the configured walk of the biases, at least 1.
+    """Factors on the configured walk of the biases.
 
     Attributes:
-        times: (2,) of accelerometers and of gyroscopes.
+        times: (2,) factors of accelerometers and of gyroscopes, at least 1.
     """
 
     def __init__(self) -> None:
@@ -40,7 +43,7 @@ class BiasWalk:
         self.begin()
 
     def begin(self) -> None:
-        """A window has begun, or was built anew: what was known before is not by the same data, nor as they are weighed now."""
+        """Forget the biases so far: those of a new or rebuilt window come of other data or other weights."""
         self._known: list[KnownBias] = []
         self._since_ns: int | None = None
 
@@ -49,7 +52,14 @@ class BiasWalk:
         return sensor.scaled(dict(zip(WALK_KEYS, self.times.tolist(), strict=True)))
 
     def changed(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
-        """Raise the walk of accelerometers or gyroscopes where that is needed, lower it where it is no more; return a line on that, or empty."""
+        """Raise the walk of accelerometers or gyroscopes where that is needed, and lower it where it no longer is.
+
+        Args:
+            samples: gives the IMU samples of the window.
+
+        Returns:
+            A line on the change, or empty.
+        """
         newest = lag.newest
         R = newest.pose.rotation().matrix()
         if (R @ newest.pose_cov[:3, :3] @ R.T)[2, 2] > _HEADING_RAD**2:
@@ -64,7 +74,7 @@ class BiasWalk:
         return self._raised(lag, samples) or self._lowered(lag, samples)
 
     def _raised(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
-        """Raise the walk where how far the biases have gone tells it, and return a line on that; or empty."""
+        """Raise the walk where the biases have changed by too much; return a line on that, or empty."""
         *before, now = self._known[-_RAISED_BY - 1 :]
         found = went_too_far(before, now, lag.problem.links, lasting=True)
         if found is None:
@@ -78,7 +88,7 @@ class BiasWalk:
         return too_steady(name, imu, self.of(imu))
 
     def _lowered(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
-        """Lower a raised walk to what the biases have gone at most, and return a line on that; or empty."""
+        """Lower a raised walk to the most that explains how little biases changed; return a line on that, or empty."""
         for k in np.flatnonzero(self.times > 1.0).tolist():
             share = walks_less(self._known, lag.problem.links, k)
             less = 1.0 if share is None else max(share, 1.0 / self.times[k])
@@ -92,10 +102,10 @@ class BiasWalk:
 
 
 def walks_less(known: Sequence[KnownBias], links: InertialLink, k: int) -> float | None:
-    """Return what share of the walk explains, at most, how little biases have gone of late (0: of accelerometers, 1: of gyroscopes); None: none is told.
+    """Return the largest share of the walk that explains how little biases have changed; None: the whole walk does.
 
     Args:
-        known: of one estimate, by stamp.
+        known: the biases of one window, by stamp. k: 0 for accelerometers, 1 for gyroscopes.
     """
     steps = sorted((step for axis in range(3 * k, 3 * k + 3) for step in _steps(known, links, axis)), reverse=True)
     squares = np.cumsum([square for _, square in steps])
@@ -108,7 +118,11 @@ def walks_less(known: Sequence[KnownBias], links: InertialLink, k: int) -> float
 
 
 def _steps(known: Sequence[KnownBias], links: InertialLink, axis: int) -> Iterator[tuple[int, float]]:
-    """Yield, from the last, by how much one bias went in steps that its walk rules: since when, and the square by what it should."""
+    """Yield the changes of one bias, the last first, over steps so long that its walk exceeds its variance (`_CLEAR`).
+
+    Yields:
+        The stamp (ns) at which the step begins, and the squared change over its expected variance.
+    """
     later = known[-1]
     for then in reversed(known[:-1]):
         walk = links.bias_steps(then.stamp_ns, later.stamp_ns)[axis] ** 2

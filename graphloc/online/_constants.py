@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Constants that measurements of a sensor share. Survey errors of tags are in the graph while observed, and remembered afterwards."""
+"""Constants that measurements of a sensor share.
+
+Survey errors of tags are in the graph while measurements observe them, and are remembered outside it afterwards.
+Constants that correct a setting (a delay, the place of an antenna) stay in the graph.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window
 from graphloc.solve.warnings import FAR_OFF, far_off
 
-_CHANGED = 0.05  # change of the sigma of a prior from which it is replaced
+_CHANGED = 0.05  # relative change of a prior's sigma from which the prior is replaced
 
 Number = tuple[str, int]
 """Name of a sensor, and number of one of its constants."""
@@ -28,16 +32,17 @@ class Constants:
     """The constants of all sensors.
 
     Args:
-        known: estimates from before the window.
+        problem, window: where the constants are. known: estimates from before the window.
 
     Raises:
-        SolveError: one of them is of another size (from a snapshot, by another configuration).
+        SolveError: a known estimate is of another size, as it is from a snapshot that another configuration wrote.
     """
 
     def __init__(self, problem: LiveProblem, window: Window, known: Mapping[Number, ConditionalGaussian]) -> None:
         self._problem, self._window = problem, window
         self._known: dict[int, ConditionalGaussian] = {}
-        self._priors: dict[int, tuple[Held, Array]] = {}  # the revisable part of each, and its sigmas (see `revisable`)
+        # By key: the revisable part of the prior, and its sigmas (see `revisable`)
+        self._priors: dict[int, tuple[Held, Array]] = {}
         for stream in problem.streams.values():
             for n, (key, constant) in enumerate(zip(constant_keys(stream), stream.constants, strict=True)):
                 if (found := known.get((stream.name, n))) is None:
@@ -47,7 +52,11 @@ class Constants:
                 self._known[key] = found
 
     def begin(self, anchor: Anchor, state: Sequence[int]) -> None:
-        """Stage those that are known together with the anchor's state, by the keys of its pose, velocity and bias, and those that correct a setting."""
+        """Stage the known constants that are correlated with the anchor's state, and those that correct a setting.
+
+        Args:
+            anchor: where the window begins. state: keys of its pose, velocity and bias.
+        """
         settings = {key: constant for constant, key in self._settings()}
         for key, known in [*self._known.items()]:
             if key in settings or known.gain.any():
@@ -58,19 +67,19 @@ class Constants:
                 self._hold(settings[key], key, known.value)
 
     def _settings(self) -> Iterator[tuple[Constant, int]]:
-        """Yield the constants that correct a setting, with their keys."""
+        """Yield the constants that correct a setting, each once, with their keys."""
         for stream in self._problem.streams.values():
             if stream.shares is None:
                 pairs = zip(stream.constants, constant_keys(stream), strict=True)
                 yield from ((constant, key) for constant, key in pairs if constant.corrects)
 
     def _hold(self, constant: Constant, key: int, value: Array) -> None:
-        """Stage the revisable part of a prior, as at an estimate (k,)."""
+        """Stage the revisable part of a constant's prior, with the sigmas that it has at an estimate (k,)."""
         sigma = revisable(constant.sigma, constant.widened(value))
         self._priors[key] = self._window.add([_about_zero(key, sigma)]), sigma
 
     def revise(self) -> None:
-        """Weigh the priors of those that correct a setting as the estimate has them now."""
+        """Replace the priors of constants that correct a setting, where their sigmas at the present estimate differ."""
         for constant, key in self._settings():
             if key in self._priors:
                 (held, was), value = self._priors[key], self._window.values.atVector(key)
@@ -79,7 +88,7 @@ class Constants:
                     self._hold(constant, key, value)
 
     def revisable_variance(self, key: int) -> Array:
-        """Return the variance (k,) of the revisable part of a prior, which an anchor is without; inf: there is none."""
+        """Return the variance (k,) of the revisable part of a prior, which anchors leave out; inf: there is none."""
         if key in self._priors:
             return self._priors[key][1] ** 2
         return np.full(len(self._window.values.atVector(key)), np.inf)
@@ -91,7 +100,7 @@ class Constants:
                     yield (stream.name, n), key
 
     def use(self, stream: LiveStream, used: set[int]) -> None:
-        """Stage those constants of a stream that are among the `used` keys of new factors, and keep them in the window."""
+        """Stage the constants of a stream that new factors use, and keep them; `used`: keys of these factors."""
         window, timeline = self._window, self._problem.timeline
         now_s = timeline.page_s(timeline.stamps_ns[timeline.last])
         for key, constant in zip(constant_keys(stream), stream.constants, strict=True):
@@ -117,7 +126,7 @@ class Constants:
             window.touch(key, now_s)
 
     def marked(self) -> Callable[[], None]:
-        """Return a function that restores what is known here: what was taken into the graph since has then left it again."""
+        """Return a function that restores what is known outside the graph; the window must be restored alike."""
         known, priors = dict(self._known), dict(self._priors)
 
         def back() -> None:
@@ -126,10 +135,11 @@ class Constants:
         return back
 
     def remember(self, now_s: float) -> None:
-        """Remember the constants that the next commit would marginalise; those that correct a setting stay in the window instead.
+        """Remember constants that the next commit would marginalise; those that correct a setting stay in the graph.
 
-        These are known together with the position, and would tell of it again, as after a restart: of a vessel that lay still, four
-        outages of 8 s (lag 4 s) made the bound 0.66 m instead of 1.23 m.
+        Constants that correct a setting are correlated with the position. If they were remembered without it, they
+        would tell of the position again later: of a vessel that lay still, four outages of 8 s (lag 4 s) made the bound
+        0.66 m instead of 1.23 m.
         """
         for stream in self._problem.streams.values():
             for constant, key in zip(stream.constants, constant_keys(stream), strict=True):
@@ -142,7 +152,7 @@ class Constants:
                     self._known[key] = ConditionalGaussian.independent(value, self._window.covariance([key]))
 
     def of(self, stream: LiveStream) -> Iterator[tuple[Constant, Array]]:
-        """Yield the constants of a stream that measurements have told of, and their values (k,)."""
+        """Yield the constants of a stream that measurements have observed, and their values (k,)."""
         for constant, key in zip(stream.constants, constant_keys(stream), strict=True):
             if self._window.is_committed(key):
                 yield constant, self._window.values.atVector(key)
@@ -150,13 +160,17 @@ class Constants:
                 yield constant, self._known[key].value
 
     def far_off(self, stream: LiveStream) -> Iterator[tuple[str, float, str]]:
-        """Yield each setting of a stream that is clearly far from where the window has it, by how much, and a line on that."""
+        """Yield each setting of a stream that is clearly far from its estimate in the window.
+
+        Yields:
+            Key of the setting, by how much it is off, and a line on that.
+        """
         for constant, key in zip(stream.constants, constant_keys(stream), strict=True):
             if constant.corrects and self._window.is_committed(key):
                 value = self._window.values.atVector(key)
                 for setting, by, said in far_off(stream.name, constant, value, stream.mount):
                     sigma = np.sqrt(np.diag(self._window.covariance([key])))
-                    # Of a place the largest: a mount may turn its axes.
+                    # Of a place, take the largest sigma of its axes: a mount may turn these.
                     same = PLACE if setting in PLACE else (setting,)
                     unsure = max(sigma[n] for n, key_of in constant.settings if key_of in same)
                     if abs(by) > FAR_OFF * unsure:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The measurements of the window: how each was judged, and its factors in the graph."""
+"""The measurements of the window: the verdict on each, and its factors in the graph."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from graphloc.online._window import Held, Window, keys_of
 from graphloc.solve.decide import NEGLIGIBLE, Verdict, residuals_at
 from graphloc.solve.ledger import row_of
 
-_CHANGED = 0.1  # change of a weight from which its factors are replaced
-_MOVED_M, _TURNED_RAD = 0.1, 0.01  # from the pose that a factor was linearised at
-_SAME = 1e-9  # m, rad: below it the solver has not relinearised the pose
+_CHANGED = 0.1  # change of a weight (or relative change of a variance) from which the factors are replaced
+_MOVED_M, _TURNED_RAD = 0.1, 0.01  # distance and angle from the pose of linearisation, beyond which a factor is wrong
+_SAME = 1e-9  # m, rad: change of a linearisation point that is only rounding
 
 
 @dataclass(slots=True, eq=False)
 class Entry:
-    """A measurement in the window, its verdict, and its factors (`held`)."""
+    """A measurement in the window, its verdict, and its factors (`held`); None: it is not in the graph."""
 
     stream: LiveStream
     index: int
     verdict: Verdict
     held: Held | None = None
     written: Any = None  # the pose in whose tangent its factors are written
-    linear: bool = False  # whether one of them is linear: GTSAM does not turn it with the pose
-    widened: bool = False  # its kernel was widened, because the prediction was uncertain
-    judged: bool = False  # among hypotheses, at least once
+    linear: bool = False  # whether one of its factors is linear: GTSAM does not turn such a factor with the pose
+    widened: bool = False  # whether its kernel was widened, because the prediction was uncertain
+    judged: bool = False  # whether it was judged among hypotheses at least once
 
     @property
     def measurement(self) -> Measurement:
@@ -50,17 +50,17 @@ class Entry:
 
     @property
     def within(self) -> tuple[int, float] | None:
-        """Mode and weight with which it is in the graph; None: it is not."""
+        """Mode and weight with which the measurement is in the graph; None: it is not."""
         decision = self.verdict.decision
         return None if self.held is None or decision is None else (self.verdict.mode, decision.weight)
 
     def reaches(self, first: int) -> bool:
-        """Whether its state, and the one that it is propagated from, are still in the window."""
+        """Return whether the measurement's state, and the one that the IMU carries to its stamp, are in the window."""
         carry = self.stream.carry[self.index]
         return self.state >= first and (carry is None or carry[0] >= first)
 
     def weighs_other(self, verdict: Verdict) -> bool:
-        """Whether weight or variance differ so much that the factors must be replaced."""
+        """Return whether another verdict differs so much in weight or variance that the factors must be replaced."""
         new, old = (
             float(np.trace(v.residual.cov)) / (v.decision.weight if v.decision else 1.0)
             for v in (verdict, self.verdict)
@@ -68,7 +68,7 @@ class Entry:
         return abs(verdict.weight - self.verdict.weight) > _CHANGED or abs(new - old) > _CHANGED * old
 
     def differs(self, verdict: Verdict) -> bool:
-        """Whether the factors in the graph must be replaced: decided otherwise, or linearised elsewhere."""
+        """Return whether the factors in the graph must be replaced: decided otherwise, or linearised elsewhere."""
         old = self.verdict
         if (self.held is None) != (verdict.decision is None):
             return True
@@ -82,7 +82,7 @@ class Entry:
 
 
 class Entries:
-    """All entries of the window. The decision on each is in the graph, or staged; `change` replaces it."""
+    """All entries of the window; the factors of each are in the graph or staged, and `change` replaces them."""
 
     def __init__(self, problem: LiveProblem, window: Window, constants: Constants) -> None:
         self._problem, self._window, self._constants = problem, window, constants
@@ -90,7 +90,7 @@ class Entries:
         self._gone: list[LedgerRow] = []
 
     def reachable(self, entry: Entry) -> bool:
-        """Whether an entry can still be judged: it and its states are in the window."""
+        """Return whether an entry can still be judged: it and its states are in the window."""
         here = (entry.stream.number, entry.index) in self._entries
         return here and entry.reaches(self._problem.timeline.first)
 
@@ -105,10 +105,10 @@ class Entries:
         return (e for e in self._entries.values() if e.reaches(first))
 
     def information(self, stream: LiveStream, since: int) -> Array:
-        """Return what the measurements of a stream from an index on tell of their states, as judged.
+        """Return the information of the measurements of a stream, from index `since` on, as judged.
 
-        (9, 9), on rotation, position and velocity, in axes of world; with its slow error, if that is estimated: (9 + k, 9 + k). Of a receiver
-        whose slow error is left out but for its jumps, these are taken for known.
+        It is (9, 9), on rotation, position and velocity in axes of world. If the stream's slow error is estimated, it
+        is (9 + k, 9 + k), with that. Jumps of a slow error that is otherwise left out count as known.
         """
         width = 9 if stream.slow is None or stream.left_out is not None else 9 + len(stream.slow.sigma)
         total = np.zeros((width, width))
@@ -132,12 +132,12 @@ class Entries:
     # In the graph
 
     def add(self, entry: Entry) -> None:
-        """Add a new entry, as judged."""
+        """Add a new entry, and stage its factors."""
         self._put(entry)
         self._entries[(entry.stream.number, entry.index)] = entry
 
     def change(self, entry: Entry, verdict: Verdict) -> None:
-        """Replace the factors of an entry by those of a new verdict; no change where some have been marginalised."""
+        """Replace the factors of an entry by those of a new verdict; not where some have been marginalised."""
         if entry.held is not None:
             if not self._window.remove(entry.held):
                 return
@@ -146,7 +146,7 @@ class Entries:
         self._put(entry)
 
     def marked(self, own: Collection[Entry]) -> Callable[[], None]:
-        """Return a function that restores the window as it is now (nothing being staged), and these entries."""
+        """Return a function that restores the window and the entries `own` as they are now; nothing may be staged."""
         window, constants_back = self._window.marked(), self._constants.marked()
         entries = [(e, e.verdict, e.held, e.written, e.judged) for e in own]
         places = [(held, tuple(held.slots)) for _, _, held, _, _ in entries if held is not None]
@@ -178,7 +178,7 @@ class Entries:
         entry.linear = any(isinstance(factor, gtsam.LinearContainerFactor) for factor in update.factors)
 
     def reintegrate(self, stale: Collection[int]) -> None:
-        """Integrate again from these states to the measurements after them: samples in between came late."""
+        """Integrate the IMU again from the states `stale` to the measurements after them: samples came late there."""
         for entry in self._all_reachable():
             carry = entry.stream.carry[entry.index]
             if carry is not None and carry[0] in stale:
@@ -187,17 +187,18 @@ class Entries:
                     self._write(entry)
 
     def follow_solver(self) -> None:
-        """Replace factors written in a tangent that the solver no longer uses, or before their next slow node existed."""
+        """Replace factors written in a tangent that the solver no longer uses, or before the next slow node existed."""
         self._write_anew(self._left_behind)
 
     def follow_estimate(self) -> None:
-        """Replace factors linearised at a pose that the estimate has moved away from: judged there, right ones look false."""
+        """Replace factors linearised at a pose that the estimate has left: by these, right measurements look false."""
         self._write_anew(self._elsewhere)
 
     def _write_anew(self, stale: Callable[[Entry], bool]) -> None:
-        """Relinearise the stale factors that measure position: those of sensors with hypotheses, and those that GTSAM cannot.
+        """Relinearise the stale factors of sensors with hypotheses, and the linear ones that measure position.
 
-        Linearised where the heading is 20 deg off, fixes would say that a step of a metre ended 0.3 m beside its end.
+        GTSAM does not relinearise these. Factors of fixes that were linearised with the heading 20 deg off would put
+        the end of a step of one metre 0.3 m aside.
         """
         for entry in self._all_reachable():
             row = entry.stream.row
@@ -220,7 +221,7 @@ class Entries:
         return _moved(at.T_world_body, self._window.values.atPose3(at.pose_key))
 
     def expected_cost(self) -> float:
-        """Return the expected sum of weighted squares of what is in the graph: one per axis, times its weight."""
+        """Return the expected sum of weighted squares in the graph: of each measurement, its weight times its axes."""
         return sum(e.verdict.expected_cost for e in self._entries.values() if e.held is not None)
 
     # In the ledger
@@ -237,12 +238,12 @@ class Entries:
             stream.forget(kept)
 
     def gone(self) -> list[LedgerRow]:
-        """Return ledger rows of measurements that have left since this was last called."""
+        """Return the ledger rows of measurements that have left the window since the last call."""
         rows, self._gone = self._gone, []
         return [row for row in rows if row.seq >= 0]
 
     def held(self) -> list[LedgerRow]:
-        """Return ledger rows of the measurements in the window, as judged now."""
+        """Return the ledger rows of the measurements in the window, as judged now."""
         return [_row(e) for e in self._entries.values() if e.measurement.seq >= 0]
 
 
@@ -252,6 +253,6 @@ def _row(entry: Entry) -> LedgerRow:
 
 
 def _moved(a: Any, b: Any) -> bool:
-    """Whether two poses differ so much that a factor linearised at one is wrong at the other."""
+    """Return whether two poses differ so much that a factor linearised at one is wrong at the other."""
     step = a.localCoordinates(b)
     return float(np.linalg.norm(step[3:])) > _MOVED_M or float(np.linalg.norm(step[:3])) > _TURNED_RAD

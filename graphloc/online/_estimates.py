@@ -38,15 +38,18 @@ def estimate_of(
     guess: bool,
     unmodelled: UnmodelledError | None,
 ) -> Estimate:
-    """Return the estimate at a state of the window, or propagated beyond it.
+    """Return the `Estimate` of the newest state of a window, or of that state propagated by the IMU.
 
     Args:
+        now: the state. lag: the window. odometry: the `odom` frame.
         agreed_ns: stamp at which each absolute sensor last agreed. absolute: names of all absolute sensors.
         doubt: why the health cannot be good, or empty.
-        unmodelled: what slow errors that are left out, and the IMU's mount, do to the newest state; the covariances then include it.
-        heading_off_rad: by how much the motion shows the heading to be off; the covariance then includes it.
-        heading_var: of the heading, rad^2, where no sensor measures it and the window's own covariance is too sure; else 0.
+        heading_off_rad: by how much the motion shows the heading to be off; the covariance includes it.
+        heading_var: variance of the heading, rad^2, where no sensor measures it, because the window's own is then too
+            small; else 0.
         guess: whether the heading is a guess.
+        unmodelled: effect of slow errors that are left out, and of the IMU's mount, on the newest state; the
+            covariances include it. None: there is no such effect.
     """
     newest, problem = lag.newest, lag.problem
     at_ns, lever = now.stamp_ns, -problem.t_body_imu_m
@@ -87,14 +90,16 @@ def estimate_of(
 
 
 def _covariances(now: Propagated, lag: Lag, R: Array, unmodelled: UnmodelledError | None) -> tuple[Array, Array]:
-    """Return those of the pose of the body's origin (6, 6) and of the velocity (3, 3), axes of world, with what is left out of the window.
+    """Return the covariances of the pose of the body's origin (6, 6) and of the velocity (3, 3), in axes of world.
+
+    They include the effect of what is left out of the window.
 
     Args:
-        R: (3, 3) attitude. unmodelled: as of `estimate_of`.
+        R: (3, 3) attitude. now, lag, unmodelled: as of `estimate_of`.
     """
     lever = -lag.problem.t_body_imu_m
     cov, v_cov = world_covariance(sound(now.pose_cov), R, lever), now.velocity_cov
-    if unmodelled is not None:  # else there is nothing of that
+    if unmodelled is not None:
         ahead_s = (now.stamp_ns - unmodelled.newest.stamp_ns) / NS_PER_S
         cov += unmodelled.pose(R @ lever, ahead_s)
         v_cov = v_cov + unmodelled.velocity

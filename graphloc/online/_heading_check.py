@@ -1,21 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Does the heading fit the motion? The accelerations, rotated by the estimate, must move the antenna as its fixes do.
 
-Over 40 s, horizontal vectors as complex numbers, east + i north:
+The last 40 s are fitted, with horizontal vectors as complex numbers, east + i north:
 
     place(t) = a + b t + c t^2 + d t^3 + f ahead2(t) + g ahead3(t) + h ahead(t) + rho reckoned(t)
 
-place: of the antenna, by its fixes. reckoned: the same by dead reckoning: the specific force in axes propagated by the
-gyroscope, integrated twice, plus the lever arm. ahead, ahead2, ahead3: exp(i yaw), as it is, integrated twice and three
-times. h: where the antenna is off its mount, while the heading is a guess that bends its estimate. a, b: position and
-velocity; c, d: gravity, by a tilt that is wrong or changes; f, g: biases of the accelerometer and the gyroscope, about 0 and
-not about the estimated ones, which are wrong too where the heading is. With the right heading rho = 1; a heading that is off
-by e gives rho = exp(-i e). A gyroscope bias of 0.02 rad/s about the vertical turns what is reckoned by 0.8 rad in 40 s: where
-the heading fits with the estimated bias taken off, nothing is reported. So a compass with a wrong mount or convention is told
-from a vessel that moves astern, sideways or with a current: there the accelerations fit the motion. The course over ground
-cannot tell these apart. Where the fixes jump, place has a step. Fixes that are late turn it where the vessel turns, by what
-it turns meanwhile: where their stamps may be off (`stamp_sigma_s`), and the heading fits with a term in the velocity of what
-is reckoned, nothing is reported.
+- place: of the antenna, by its fixes; it has a step where these jump.
+- reckoned: place by dead reckoning: the specific force in axes propagated by the gyroscope, integrated twice, plus the
+  lever arm.
+- ahead: exp(i yaw). ahead2, ahead3: ahead integrated twice and three times.
+- a, b: position and velocity. c, d: gravity, by a tilt that is wrong or changes.
+- f, g: biases of the accelerometer and the gyroscope. Their priors are about 0, not about the estimated biases, which
+  are wrong too where the heading is.
+- h: by how much the antenna is off its mount; only while the heading is a guess, which bends the estimate of that.
+- rho: 1 with the right heading; exp(-i e) with a heading that is off by e.
+
+So a compass with a wrong mount or convention is told from a vessel that moves astern, sideways or with a current: there
+the accelerations fit the motion. The course over ground cannot tell these apart.
+
+Two other causes of a wrong rho are tried before anything is reported. A gyroscope bias of 0.02 rad/s about the vertical
+turns `reckoned` by 0.8 rad in 40 s, so the fit is repeated with the estimated bias taken off. Late fixes turn `place`
+while the vessel turns, so where their stamps may be off (`stamp_sigma_s`), the fit is repeated with a term in the
+velocity of `reckoned`.
 """
 
 from __future__ import annotations
@@ -35,24 +41,32 @@ from graphloc.solve.covariances import world_covariance
 from graphloc.time import stamps_of
 from graphloc.trajectory import bounds_95
 
-# In 40 s most vessels turn or change their speed; over longer ones biases bend what is reckoned by more. Every 5 s; choices.
+# Length of the data, and time between checks; choices. In 40 s most vessels turn or change their speed; over a longer
+# time, biases bend the dead reckoning by more.
 _WINDOW_S, _EVERY_S = 40.0, 5.0
 _LONGEST_STEP_S = 1.0  # of the IMU; in a longer gap the accelerations are unknown
-_TURNED_RAD, _KNOWN_DEG = np.radians(20.0), 20.0  # reported from this error on, where the 95 % bound is smaller
-_SIGMAS = 3.0  # and from so many sigmas of the check itself on
-_SIZE, _SURE = (0.7, 1.4), 0.2  # |rho| is near 1 unless fixes jump; largest sigma of rho
-_LIKELY = 2.5  # sigmas of rho: so far from 0, and no farther from 1, it says something of the heading
+# An error is reported from this size on, where the 95 % bound is smaller
+_TURNED_RAD, _KNOWN_DEG = np.radians(20.0), 20.0
+_SIGMAS = 3.0  # sigmas of the check itself that a reported error must exceed, too
+_SIZE, _SURE = (0.7, 1.4), 0.2  # range of |rho|, which is near 1 unless fixes jump; largest sigma of rho
+# rho tells the heading if it is more sigmas than this from 0, and |rho| exceeds 1 by fewer (or by `_SIZE`)
+_LIKELY = 2.5
 _APART_S = 1.0  # correlation time of the errors of fixes, at least
 _FEWEST = 15  # fixes, for up to 15 real unknowns of four terms, three biases, rho and a jump; a choice
 _ENDS = slice(2, -2)  # fixes at which a jump would show
 _IN_A_ROW = 2  # checks that must agree before the heading is called wrong, or right again
-_LATE_S = 0.5  # 1 sigma of a delay of fixes whose stamps may be off: those that come through a gateway are by a second
-_COMPLEX = np.array([1.0, 1j])  # of a horizontal vector: east + i north
-_BIASES = np.array([0.1, 9.8 * 0.005])  # 1 sigma: m/s^2, and of the rate that tilts gravity, m/s^3
+_LATE_S = 0.5  # 1 sigma of the delay of fixes whose stamps may be off: through a gateway they come a second late
+_COMPLEX = np.array([1.0, 1j])  # makes a horizontal vector complex: east + i north
+# 1 sigma of f, m/s^2, and of g, m/s^3: gravity times a gyroscope bias of 0.005 rad/s.
+_BIASES = np.array([0.1, 9.8 * 0.005])
 
 
 class _Step(NamedTuple):
-    """The IMU between two stamps, without gravity, in the body's axes at the first: change of velocity (3,), of position (3,), rotation (3, 3)."""
+    """The IMU integrated between two stamps, without gravity, in the body's axes at the first.
+
+    Attributes:
+        from_ns, until_ns: the stamps. dv, dp: (3,) change of velocity, m/s, and of position, m. dR: (3, 3) rotation.
+    """
 
     from_ns: int
     until_ns: int
@@ -80,10 +94,10 @@ class HeadingCheck:
     """Compares the fixes of one receiver with the steps of the IMU.
 
     Attributes:
-        said: what is wrong with the heading, in plain words; empty where nothing is known to be.
-        off_rad: by how much it is off, as far as that is known; 0 while nothing is said.
-        looked_ns: stamp of the last check. within_rad: 1 sigma of the heading by it alone, its error included; infinite where it told
-            nothing.
+        said: what is wrong with the heading, in words; empty where nothing is known to be wrong.
+        off_rad: error of the heading by the check; 0 while `said` is empty.
+        looked_ns: stamp of the last check. within_rad: 1 sigma of the heading by that check alone, the error found
+            included; infinite where the check told nothing.
     """
 
     def __init__(self) -> None:
@@ -94,7 +108,7 @@ class HeadingCheck:
         self.looked_ns, self._wrong, self._right, self._fits = 0, 0, 0, 0
 
     def begin(self) -> None:
-        """Forget what earlier checks found right: the estimate starts anew."""
+        """Forget that earlier checks found the heading right: the estimate starts anew."""
         self._right = self._fits = 0
         self.within_rad = np.inf
 
@@ -109,7 +123,7 @@ class HeadingCheck:
         return self._fits >= _IN_A_ROW
 
     def note(self, m: Measurement, lag: Lag) -> None:
-        """Take in a position of the first GNSS receiver (any absolute sensor without hypotheses), unless it is frozen."""
+        """Take in a position, if it is of the first absolute sensor without hypotheses (GNSS) that is not frozen."""
         stream = lag.problem.streams.get(m.sensor)
         if (
             stream is None
@@ -128,7 +142,7 @@ class HeadingCheck:
         """Integrate the IMU to the newest state and check the heading; return whether it is newly found to be wrong.
 
         Args:
-            guessed: the heading is a guess, and where the window has the antenna is bent by it.
+            guessed: whether the heading is a guess, which bends the window's estimate of where the antenna is.
         """
         newest = lag.newest
         self._carry_on(lag, newest)
@@ -138,10 +152,10 @@ class HeadingCheck:
         self.looked_ns, self.within_rad = newest.stamp_ns, np.inf
         if self._sensor not in lag.problem.streams:
             return False
-        # That a receiver repeats a fix may turn out after it was noted.
+        # That a fix is a repetition may turn out only after it was noted.
         repeated = lag.problem.streams[self._sensor].receiver.repeated_fix
         self._fixes = deque(fix for fix in self._fixes if not repeated.is_old(fix.stamp_ns, fix.p_world_m))
-        # Not with the estimated bias, which a guess has bent until it fits.
+        # The estimated bias is not taken off: a wrong heading bends it until it fits.
         fit = self._fit(lag, newest, np.zeros(3), any_place=guessed)
         self.within_rad = _within_rad(fit)
         found = _off(fit)
@@ -201,19 +215,20 @@ class HeadingCheck:
             self._fixes.popleft()
 
     def _may_be_late(self, lag: Lag) -> bool:
-        """Whether the stamps of the fixes may be off; what measures whole poses has none of its own."""
+        """Return whether the stamps of the fixes may be off; a sensor of whole poses has no such setting."""
         return float(getattr(lag.problem.streams[self._sensor].config, "stamp_sigma_s", 0.0)) > 0.0
 
     def _fit(
         self, lag: Lag, newest: Newest, drift_radps: Array, *, any_place: bool = False, late: bool = False
     ) -> Fit | None:
-        """Return how the fixes follow the accelerations; None where there are too few.
+        """Return the fit of rho; None where there are too few fixes, or the data are too short.
 
         Args:
-            drift_radps: (3,) gyroscope bias to take off, body axes. any_place: the antenna is anywhere about its mount. late: the fixes
-                may be late, or early.
+            drift_radps: (3,) gyroscope bias to take off, body axes. any_place: whether to fit where the antenna is
+                about its mount (h).
+            late: whether to fit a delay of the fixes.
         """
-        # What measures whole poses has no antenna.
+        # A sensor of whole poses has no antenna.
         place_m = getattr(lag.problem.streams[self._sensor].config, "mount_sigma_m", 0.0) if any_place else 0.0
         at_s, regressors = self._reckoned(lag, newest, drift_radps, place_m)
         prior_sigmas = np.append(_BIASES, [place_m] if place_m else [])
@@ -232,7 +247,7 @@ class HeadingCheck:
         nuisance = np.hstack([np.vander(1.0 + 2.0 * fix_s / _WINDOW_S, 4), after_jump])
         basis, _ = np.linalg.qr(nuisance[_ENDS])
         columns = np.column_stack([place, *at_fixes])[_ENDS]
-        columns = columns - basis @ (basis.T @ columns)  # what no cubic and no step explains
+        columns = columns - basis @ (basis.T @ columns)  # what neither the cubic nor steps explain
         observed, design = columns[:, 0], columns[:, 1:]
         residual = observed - design @ np.linalg.lstsq(design, observed, rcond=None)[0]
         independent = _WINDOW_S / _APART_S  # fixes closer together share their errors
@@ -246,11 +261,12 @@ class HeadingCheck:
         """Dead-reckon the antenna by the steps of the IMU, from rest.
 
         Args:
-            drift_radps: as in `_fit`. place_m: how far from its mount the antenna may be, 1 sigma; 0: it is where the window has it.
+            drift_radps: as in `_fit`. place_m: how far from its mount the antenna may be, 1 sigma; 0: take it where the
+                window has it.
 
         Returns:
-            times (N,), s, relative to the newest state; reckoned, ahead2, ahead3 and, with a `place_m`, ahead (3 or 4, N), complex, in
-            world as the newest state has the attitude.
+            Times (N,), s, relative to the newest state; and (3 or 4, N) complex: reckoned, ahead2, ahead3 and, where
+            `place_m` is not 0, ahead, in axes of world by the newest state's attitude.
         """
         lever_m = _mount_m(lag, self._sensor) if place_m else _lever_m(lag, self._sensor)
         # In the body's axes at the first step ("start"), without gravity.
@@ -277,7 +293,7 @@ def _mount_m(lag: Lag, receiver: str) -> Array:
 
 
 def _lever_m(lag: Lag, receiver: str) -> Array:
-    """Return where an antenna is from the IMU (3,), m, body axes, as the window has it."""
+    """Return where an antenna is from the IMU (3,), m, body axes, as the window estimates it."""
     return _mount_m(lag, receiver) + lag.antennas_off_m().get(receiver, np.zeros(3))
 
 
@@ -289,12 +305,12 @@ def _off(fit: Fit | None) -> tuple[float, float] | None:
 
 
 def _within_rad(fit: Fit | None) -> float:
-    """Return 1 sigma of the heading by a fit alone, its error included; infinite where it tells nothing."""
+    """Return 1 sigma of the heading by a fit alone, the error found included; infinite where the fit tells nothing."""
     if fit is None or not _LIKELY * fit.sigma < abs(fit.rho) < 1.0 + max(_SIZE[1] - 1.0, _LIKELY * fit.sigma):
         return np.inf
     return float(np.hypot(np.angle(fit.rho), fit.sigma / abs(fit.rho)))
 
 
 def _turned(off_rad: float, sigma_rad: float) -> bool:
-    """Whether an error of the heading is too large, and no noise."""
+    """Return whether an error of the heading is large, and larger than noise."""
     return bool(abs(off_rad) > max(_TURNED_RAD, _SIGMAS * sigma_rad))

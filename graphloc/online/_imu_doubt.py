@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is the IMU wrong? Where sensors that were right a moment ago deny the estimate at once, it is: a wrong unit, a loose plug, a saturated axis.
+"""Is the IMU wrong: a wrong unit, a loose plug, a saturated axis? Sensors then deny the estimate together.
 
-One sensor that disagrees is itself in doubt, and its kernel takes its weight. Two that begin to within seconds of each other have
-one thing in common: the motion between them and what was known before. So the samples since then are tried as a gap
-(`Tracking.doubt_imu`), and they are left out where that explains what denied them by a motion that a vessel may have made. What
-follows is left out for half a second, and on for as long as its rates turn otherwise than the estimate does without them. Where
-wrong ones do not (an accelerometer) and are denied again, it is twice as long each time: an IMU that stays wrong costs a rebuild every
-few seconds, one that is right again is missed for seconds.
+A single sensor that disagrees is itself in doubt, and its kernel takes its weight. Two that begin to disagree within
+seconds of each other have one thing in common: the motion by the IMU since the state that they agreed with. So the
+samples since then are tried as an IMU gap (`Tracking.doubt_imu`). They are left out if the sensors agree without them,
+by a motion that a vessel may have made.
+
+The samples that follow are left out for half a second at first, and on for as long as their rates turn otherwise than
+the estimate does without them. Samples that are wrong in another way (of an accelerometer) are used again, and denied
+again; they are then left out for twice as long, each time. So an IMU that stays wrong costs a rebuild every few
+seconds, and one that is right again is missed for seconds.
 """
 
 from __future__ import annotations
@@ -22,30 +25,34 @@ from graphloc.frames import Array
 from graphloc.solve.wrong_imu import GROWS
 from graphloc.time import duration_ns
 
-_SENSORS, _FEWEST, _MANY = 2, 2, 5  # that deny; measurements in a row of each, and of one of them at least
-_KEPT, _RIGHT = 50, 0.7  # measurements before these; share that must have agreed (with Cauchy at 1.5 sigmas, 0.87 do)
-_AT_ONCE_S = 2.5  # since the first denial: after that, a gap explains a jump of the fixes as well
-_BEFORE_S = 0.3  # the wrong samples begin before anything denies them
-_AGAIN_S = 1.0  # after a trial that explained nothing
+# Fewest sensors that deny; fewest measurements in a row of each that do, and of one sensor at least.
+_SENSORS, _FEWEST, _MANY = 2, 2, 5
+# Measurements before the denials that are remembered; share of them that must have agreed (with Cauchy at 1.5 sigmas,
+# 0.87 do).
+_KEPT, _RIGHT = 50, 0.7
+_AT_ONCE_S = 2.5  # longest time since the first denial: later on, a gap explains a jump of the fixes as well
+_BEFORE_S = 0.3  # the wrong samples begin so long before the first denial
+_AGAIN_S = 1.0  # time before the next trial, after one that explained nothing
 _HOLD_S = (0.5, 4.0)  # for how long samples are left out: at first, and at most
-_TOLD_S = 10.0  # before a gap, as the means of `factors.imu`
-_QUIET_S = 10.0  # without a denial after that, it is over
-_TURNED_RADPS = 0.6  # per sqrt(s): 3 sigmas of the turn in a gap (`factors.imu`)
+_TOLD_S = 10.0  # span before a gap whose samples tell the motion in it, as in `factors.imu`
+_QUIET_S = 10.0  # time after the last gap, without another, after which the IMU counts as right again
+_TURNED_RADPS = 0.6  # rad/s per sqrt(s): 3 sigmas of the turn in a gap (`factors.imu`)
 
 
 class Denials:
-    """Which sensors have denied the estimate on arrival, in a row, after they had agreed with it."""
+    """Which sensors deny the estimate: their newest measurements disagreed on arrival, though earlier ones agreed."""
 
     def __init__(self) -> None:
         self._in_a_row: dict[str, list[int]] = {}
-        self._sizes: dict[str, tuple[float, float]] = {}  # of the first of these, and of the last
-        self._agreed: dict[str, deque[bool]] = {}  # before these
+        self._sizes: dict[str, tuple[float, float]] = {}  # squared residuals of the first and the last of a row
+        self._agreed: dict[str, deque[bool]] = {}  # whether measurements before the row agreed
 
     def note(self, sensor: str, stamp_ns: int, size: float, *, agrees: bool, outlier: bool) -> None:
         """Note how a measurement was judged.
 
         Args:
-            size: its squared residual, in sigmas. outlier: its sensor denies any estimate now and then, so only its last ones count.
+            size: its squared residual, in sigmas^2. agrees: whether it agrees with the estimate.
+            outlier: whether its sensor denies any estimate now and then, so that only its last denials count.
         """
         stamps = self._in_a_row.setdefault(sensor, [])
         before = self._agreed.setdefault(sensor, deque(maxlen=_KEPT))
@@ -61,11 +68,13 @@ class Denials:
                 stamps.append(stamp_ns)
 
     def at_once(self, now_ns: int) -> Mapping[str, int]:
-        """Return the stamp (ns) of the first denial of each sensor that began to deny a moment ago; nothing where it may be chance.
+        """Return the stamp (ns) of the first denial of each sensor that began to deny a moment ago.
 
-        A compass of the wrong sense denies a right gyroscope as often as not, and the fixes deny what comes of it; so does no sensor
-        that was wrong before. And what is off by the same throughout has jumped, as the heading and the place of one receiver do
-        together: that of an IMU which is wrong grows.
+        Empty, if that may be chance.
+
+        Sensors that often disagreed before do not count: a compass of the wrong sense denies a right gyroscope half of
+        the time, and the fixes then deny the result. Residuals that do not grow are a jump, as of the heading and the
+        place of one receiver together; those of a wrong IMU grow.
         """
         begun = {
             name: stamps
@@ -85,8 +94,8 @@ class ImuDoubt:
     """Which samples of the IMU are left out.
 
     Attributes:
-        gaps: from after one stamp to another (ns), in order.
-        underway: whether the last of them may not have been the last.
+        gaps: (a, b) stamps (ns), in order: samples with a < stamp <= b are left out.
+        underway: whether the IMU does not count as right again yet, so that another gap may follow.
     """
 
     def __init__(self) -> None:
@@ -104,11 +113,11 @@ class ImuDoubt:
             return None
         self._tried_ns = now_ns
         since_ns, over_ns = min(denied.values()) - duration_ns(_BEFORE_S), self._over_ns()
-        # What came since the last gap is wrong from its first sample on, if it is.
+        # If the IMU is still wrong, it is so from the first sample after the last gap on.
         return over_ns if 0 <= since_ns - over_ns < _AT_ONCE_S * 1e9 else since_ns
 
     def leave_out(self, since_ns: int, now_ns: int) -> None:
-        """Leave out the samples since a stamp (ns), and those of the time to come."""
+        """Leave out the samples since a stamp (ns), and those that come for a while after now."""
         self._hold_s = min(2.0 * self._hold_s, _HOLD_S[1]) if self.underway else _HOLD_S[0]
         self.underway = True
         if self.gaps and since_ns <= self._over_ns():
@@ -117,12 +126,12 @@ class ImuDoubt:
         self._tried_ns = 0
 
     def go_on(self) -> None:
-        """Leave out more: those at the end of the last gap were wrong, or too few to tell."""
+        """Lengthen the last gap: the samples at its end were wrong, or too few to tell."""
         since_ns, until_ns = self.gaps[-1]
         self.gaps[-1] = since_ns, until_ns + duration_ns(_HOLD_S[0])
 
     def ended(self, now_ns: int) -> bool:
-        """Return whether the samples have been right for so long that it is over: once."""
+        """Return, once, that the samples have been right for so long that the IMU counts as right again."""
         ended = self.underway and now_ns - self._over_ns() > _QUIET_S * 1e9
         self.underway = self.underway and not ended
         return ended
@@ -132,7 +141,7 @@ class ImuDoubt:
         return any(a < stamp_ns <= b for a, b in self.gaps)
 
     def forget(self, before_ns: int) -> None:
-        """Forget gaps that ended before a stamp, but for the last: the next may follow it."""
+        """Forget gaps that ended before a stamp. The last is kept, because the next may continue it."""
         self.gaps = [gap for gap in self.gaps[:-1] if gap[1] >= before_ns] + self.gaps[-1:]
 
     def over(self, stamp_ns: int) -> bool:
@@ -140,7 +149,7 @@ class ImuDoubt:
         return stamp_ns > self._over_ns()
 
     def told_by(self, first_ns: int) -> list[tuple[int, int]]:
-        """Return the spans before the gaps that reach beyond a stamp: their samples tell how the vessel goes on there."""
+        """Return the spans before the gaps that reach beyond a stamp: their samples tell the motion within the gaps."""
         return [(a - duration_ns(_TOLD_S), a) for a, b in self.gaps if b >= first_ns]
 
     def _over_ns(self) -> int:
@@ -148,10 +157,11 @@ class ImuDoubt:
 
 
 def turns_otherwise(stamps_ns: NDArray[np.int64], rates_radps: Array, R: Array) -> bool:
-    """Return whether rates turn otherwise than an estimate did without them, by more than a vessel may.
+    """Return whether angular rates turn otherwise than an estimate made without them, by more than a vessel may.
 
     Args:
-        stamps_ns: (N,). rates_radps: (N, 3), body axes. R: (3, 3), rotation of the body from the first stamp to the last, by the estimate.
+        stamps_ns: (N,). rates_radps: (N, 3), body axes. R: (3, 3), rotation of the body from the first stamp to the
+            last, by the estimate.
     """
     told = gtsam.Rot3()
     for rate, dt_s in zip(rates_radps, np.diff(stamps_ns) * 1e-9, strict=False):

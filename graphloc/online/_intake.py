@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which IMU samples are taken, and in what order: clocks jump and are set back, samples come late or again or leap, units are mistaken."""
+"""Which IMU samples are taken, and in what order.
+
+Clocks jump or are set back, samples come late, twice or with a stamp far ahead, units are wrong.
+"""
 
 from __future__ import annotations
 
@@ -17,22 +20,24 @@ from graphloc.time import stamps_of
 
 _BACK = 50  # samples in a row with stamps before the newest: the clock was set back
 _LATE_S = 3.0  # how late samples may come before the start
-_HOLE = 0.7  # of the IMU's period to either side without a sample: one is missing there
-_FORCE_MPS2, _RATE_RADPS = (2.0, 100.0), 10.0  # plausible for a vessel; readings in g or deg/s fall outside
+_HOLE = 0.7  # share of the IMU's period: where no sample lies so near to either side, one is missing
+_FORCE_MPS2, _RATE_RADPS = (2.0, 100.0), 10.0  # limits for a vessel; readings in g or deg/s fall outside
 _BEHIND, _LOST = "its stamp does not increase", "held back as it leapt, and then the clock was set back"
-_PERIODS = 1000  # newest steps, from which the IMU's period is taken
+_PERIODS = 1000  # newest steps between samples, from which the IMU's period is taken
 
 
 class Taken(NamedTuple):
     """What becomes of a sample, and of one that was held back until it came.
 
     Attributes:
-        accepted: in order, each after the newest. dropped: with the reason.
-        late: the sample itself, where its stamp lies before the newest. hole: stamps (ns) of the samples before and after
-            it; None before the first.
-        absurd: why it cannot be a reading of a vessel. newly_frozen: it is the first repetition of a frozen IMU.
-        newly_spiked: what was held back was the first spike.
-        set_back_s: by how much the IMU's clock was set back; all earlier stamps are of another clock.
+        accepted: samples that are used, in order, each after the newest. dropped: samples that are not, with the
+            reason.
+        late: the sample itself, if its stamp lies before the newest and it is used. hole: stamps (ns) of the samples
+            before and after it; None if it lies before the first.
+        absurd: why it cannot be a reading of a vessel, or empty. newly_frozen: whether it is the first repetition of a
+            frozen IMU.
+        newly_spiked: whether a sample that was held back turned out to be a spike, the first of this IMU.
+        set_back_s: by how much the IMU's clock was set back, or 0; all earlier stamps are then of another clock.
     """
 
     accepted: tuple[ImuSample, ...] = ()
@@ -60,29 +65,34 @@ class ImuIntake:
     """Sorts the samples of the IMU as they arrive.
 
     Args:
-        gap_s: after a longer step a sample is held back: the next one shows whether its stamp was wrong.
-        floats: the accelerometer measures gravity, so that a small force is absurd.
+        gap_s: longest step that is no gap. After a longer one a sample is held back: the next one shows whether its
+            stamp was wrong.
+        floats: whether the accelerometer always measures gravity, so that a small force is absurd.
+
+    Attributes:
+        newest: the newest sample in use. jumped: the one that is held back because its stamp lies far ahead. None:
+            there is none.
     """
 
     def __init__(self, gap_s: float, floats: bool) -> None:
         self._gap_ns, self._floats = gap_s * 1e9, floats
         self.newest: ImuSample | None = None
-        # Held back until others follow it, so that one bad stamp does not cut the run.
+        # Held back until others follow it, so that one wrong stamp does not end the estimate.
         self.jumped: ImuSample | None = None
         self._jumped_age = self._behind = 0
         self._frozen, self._spikes = FrozenImuDetector(), SpikeDetector()
         self._spiked = False
-        self._stamps: list[int] = []  # in order, as far back as a late one may lie
+        self._stamps: list[int] = []  # of the samples in use, in order, as far back as a late one may lie
 
     def accept(self, m: ImuSample) -> float:
-        """Make a sample the newest; return how long (s) there was none before it."""
+        """Make a sample the newest; return the time (s) since the one before it."""
         before, self.newest = self.newest, m
         self._behind = 0
         self._stamps.append(m.stamp_ns)
         return 0.0 if before is None else (m.stamp_ns - before.stamp_ns) * 1e-9
 
     def restart(self, stamps_ns: list[int]) -> None:
-        """Forget all stamps but these."""
+        """Replace the stamps of the samples in use."""
         self._stamps = stamps_ns
 
     def forget(self, before_ns: int) -> None:
@@ -90,7 +100,7 @@ class ImuIntake:
         del self._stamps[: bisect_left(self._stamps, before_ns)]
 
     def take(self, m: ImuSample, *, started: bool) -> Taken:
-        """Decide on a sample, and on those that were held back. `started`: there is an estimate."""
+        """Decide on a sample, and on those that are held back; `started`: whether there is an estimate."""
         if self.newest is not None and self.newest.stamp_ns < m.stamp_ns <= self._spikes.held_ns:
             return Taken(dropped=((m, _BEHIND),))
         taken = self._in_order(m, started)
@@ -105,7 +115,7 @@ class ImuIntake:
         return taken._replace(accepted=tuple(accepted), dropped=dropped, newly_spiked=self._spiked and not already)
 
     def left(self) -> list[ImuSample]:
-        """Return what is still held back at the end."""
+        """Return the samples that are still held back at the end."""
         left = self._spikes.let_go() + ([] if self.jumped is None else [self.jumped])
         self.jumped = None
         return left
@@ -144,7 +154,10 @@ class ImuIntake:
         return f"a rate of {rate:.3g} rad/s, impossible for a vessel: wrong unit?" if rate > _RATE_RADPS else ""
 
     def _before(self, m: ImuSample, newest: ImuSample, started: bool) -> Taken:
-        """Decide on a sample with a stamp before the newest: late where one is missing, else its clock was set back."""
+        """Decide on a sample with a stamp before the newest.
+
+        It is late if a sample is missing there. Where many come that are not, the clock was set back.
+        """
         stamps = self._stamps
         n = bisect_left(stamps, m.stamp_ns)
         period_ns = float(np.quantile(np.diff(stamps[-_PERIODS:]), 0.1)) if len(stamps) > 2 else np.inf
@@ -154,7 +167,7 @@ class ImuIntake:
             hole = (stamps[n - 1], stamps[n]) if n > 0 else None
             stamps.insert(n, m.stamp_ns)
             return Taken(late=m, hole=hole)
-        # A smaller step back is caught up with, and bridged.
+        # After a smaller step back, the clock soon catches up with the newest stamp, and the gap is bridged.
         self._behind += newest.stamp_ns - m.stamp_ns > self._gap_ns
         if self._behind < _BACK:
             return Taken(dropped=((m, _BEHIND),))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which measurements in the window are believed, and with what weight: decided when each arrives, and again later.
 
-A measurement of a sensor with a robust kernel is judged on arrival, and once or twice again. Where it disagrees, but the
-prediction is too uncertain to say so (after an outage), its kernel is widened. Measurements of a sensor with hypotheses are
-judged as a sequence, as the batch solver does, and new ones against the prediction.
+A measurement of a sensor with a robust kernel is judged on arrival, and once or twice again. If its residual is large
+only because the prediction is uncertain, as after an outage, its kernel is widened. Measurements of a sensor with
+hypotheses are judged as a sequence, as by the batch solver; new ones are judged against the prediction.
 """
 
 from __future__ import annotations
@@ -34,14 +34,16 @@ from graphloc.solve.decide import AGREES, Verdict, believing, by_hypotheses
 from graphloc.solve.hypotheses import log_evidence_of
 
 _REJUDGE_AGES_S = (1.0, 4.0)  # ages at which a measurement with a kernel is judged again
-_OLDER_EVERY_S, _SURE = 1.0, 0.9  # how often an older group is judged again; a weight that needs no second round
-_CERTAIN = 0.99  # a weight that leaves no doubt
-_LOOSE = 25.0  # times the variance of the position: a choice that leaves it so uncertain does not move it
-_SHOWS = 0.01  # share of the covariance that other choices must add to be counted
-_GROUP = 10  # hypotheses that are judged as one sequence
-_ROUNDS = 2  # of judging what is new
-_CHAIN = 2  # measurements that agree with each other and not with the estimate, for a trial
-_FAR_M = 20e3  # from the estimate: not of this run; the linear algebra would fail before a kernel helps
+# How often an older group is judged again; weight from which a new one needs no second round
+_OLDER_EVERY_S, _SURE = 1.0, 0.9
+_CERTAIN = 0.99  # weight from which a measurement leaves no doubt
+_LOOSE = 25.0  # times the variance of the position: a choice that leaves it more uncertain does not move the mean
+_SHOWS = 0.01  # share of the position's covariance that other choices must add to be counted
+_GROUP = 10  # measurements that are judged as one sequence
+_ROUNDS = 2  # rounds of judging new measurements
+_CHAIN = 2  # fewest measurements that agree with each other, but not with the estimate, for a trial
+# From the estimate: farther measurements are not of this run; the linear algebra would fail before a kernel helps
+_FAR_M = 20e3
 _STEPS = 3  # iterations of the solver in a trial
 
 
@@ -49,10 +51,11 @@ class Judge:
     """Decides on the entries by the predictions of the states.
 
     Args:
-        agreement: notes how absolute sensors were judged.
+        problem, window, states, entries: the window and its parts. agreement: notes how absolute sensors were judged.
 
     Attributes:
-        receivers: checks of single receivers, before a measurement is judged. denials: of all sensors, on arrival.
+        receivers: checks of single receivers, before a measurement is judged. denials: notes which sensors deny the
+            estimate.
     """
 
     def __init__(
@@ -64,26 +67,32 @@ class Judge:
         self.receivers = ReceiverChecks(problem, states, entries, agreement)
         self._scheduled: list[tuple[float, int, Entry]] = []  # a heap: due time (s), order, entry
         self._turn = count()
-        self._rounds: dict[str, int] = {}
+        # By sensor with hypotheses:
+        self._rounds: dict[str, int] = {}  # rounds of judging that are left
         self._groups_back: dict[str, int] = {}  # which older group was judged again last, counted from the newest
-        self._rejudged_s: dict[str, float] = {}  # and when, s
-        self._refuted: set[str] = set()  # sensors with a new measurement that was judged false
+        self._rejudged_s: dict[str, float] = {}  # when that was, s
+        self._refuted: set[str] = set()  # those with a new measurement that was judged false
+        # Indices and modes of the last chain that was tried
         self._tried: dict[str, frozenset[tuple[int, int | None]]] = {}
-        self._unsure: set[str] = set()  # sensors whose choices are to be weighed
+        self._unsure: set[str] = set()  # those whose choices are to be weighed
+        # Indices and modes of the last choice that was tried
         self._chosen: dict[str, frozenset[tuple[int, int | None]]] = {}
-        self._others: dict[str, tuple[Array, Array]] = {}  # mean and covariance, of each sensor
+        self._others: dict[str, tuple[Array, Array]] = {}  # what `others` adds up: mean and covariance
 
     @property
     def others(self) -> tuple[Array, Array]:
-        """What other choices of modes, by their probability, add to the newest position in world: mean (3,), m, and covariance (3, 3)."""
+        """What other choices of modes add, weighted by their probability, to the newest position in world.
+
+        Mean (3,), m, and covariance (3, 3), m^2.
+        """
         means, covs = zip(*self._others.values(), strict=True) if self._others else ((), ())
         return np.asarray(sum(means, start=np.zeros(3))), np.asarray(sum(covs, start=np.zeros((3, 3))))
 
     def take(self, m: Measurement) -> None:
-        """Stage a measurement whose stamp lies within the window; one with hypotheses is decided on in `judge`.
+        """Stage a measurement whose stamp lies within the window; if its sensor has hypotheses, `judge` decides on it.
 
         Raises:
-            SolveError: it lies impossibly far away; nothing of it is staged.
+            SolveError: the measurement lies impossibly far away; nothing of it is staged.
         """
         stream, i = self._problem.take(m)
         at, residuals = self._entries.residuals_at(stream, i)
@@ -96,7 +105,7 @@ class Judge:
                 self.denials.note(stream.name, m.stamp_ns, residuals[0].nis(), agrees=False, outlier=False)
         elif stream.row.false is None:
             verdict, widened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
-            # Behind a widened kernel it is used, but whether it agrees shows only when it is judged again.
+            # With a widened kernel it is used, but whether it agrees shows only when it is judged again.
             if not widened or verdict.weight < AGREES:
                 self._agreement.note(stream, m, verdict)
                 agrees = verdict.weight >= AGREES
@@ -133,7 +142,11 @@ class Judge:
     def _by_kernel(
         self, stream: LiveStream, i: int, at: Attachment, residual: Residual, *, fresh: bool
     ) -> tuple[Verdict, bool]:
-        """Judge by the sensor's kernel, widened by the scatter of its residuals and, for a new one, by an uncertain prediction.
+        """Judge a measurement by its sensor's kernel, widened by the scatter of the sensor's residuals.
+
+        Args:
+            i: index of the measurement. at, residual: at the present estimate.
+            fresh: whether it is new: the kernel is then also widened where the prediction is uncertain.
 
         Returns:
             The verdict, and whether the prediction widened the kernel.
@@ -175,7 +188,11 @@ class Judge:
     # By hypotheses
 
     def _by_hypotheses(self, stream: LiveStream, own: list[Entry]) -> bool:
-        """Judge measurements of a stream as one sequence, new ones by the prediction; return whether another round may change them."""
+        """Judge measurements of a stream as one sequence, new ones against the prediction.
+
+        Returns:
+            Whether another round may change the verdicts.
+        """
         unsettled = False
         if not own:
             return False
@@ -202,7 +219,7 @@ class Judge:
         return unsettled
 
     def _note_arrival(self, stream: LiveStream, m: Measurement, verdict: Verdict) -> None:
-        """Note what the first verdict on a measurement asks for."""
+        """Note what follows from the first verdict on a measurement: a denial, a trial of others, choices to weigh."""
         agrees = verdict.weight >= AGREES
         self.denials.note(stream.name, m.stamp_ns, 0.0, agrees=agrees, outlier=True)
         if not agrees:
@@ -211,13 +228,17 @@ class Judge:
             self._unsure.add(stream.name)
 
     def _group(self, stream: LiveStream, back: int = 0) -> list[Entry]:
-        """Return a group of `_GROUP` measurements of a stream that can still be judged, by stamp: the newest, or the `back`-th before it."""
+        """Return a group of at most `_GROUP` measurements of a stream that can still be judged, by stamp.
+
+        Args:
+            back: 0: the newest group; n: the n-th before it.
+        """
         own = self._entries.of(stream)
         end = len(own) - back * _GROUP
         return own[max(end - _GROUP, 0) : max(end, 0)]
 
     def _rejudge_older(self, stream: LiveStream, now_s: float) -> None:
-        """Judge an older group again, one after another: later data may decide otherwise."""
+        """Judge the next older group again, as later data may decide otherwise; after the oldest, begin again."""
         self._rejudged_s[stream.name] = now_s
         back = self._groups_back.get(stream.name, 0) + 1
         own = self._group(stream, back)
@@ -225,14 +246,14 @@ class Judge:
         self._by_hypotheses(stream, own)
 
     def _attach(self, own: list[Entry]) -> tuple[list[Attachment], list[tuple[Residual, ...]]]:
-        """Return the attachments of entries at the present estimate, and the residuals of their modes there."""
+        """Return the attachments of entries at the present estimate, and the residuals there, one per mode."""
         met = [self._entries.residuals_at(e.stream, e.index) for e in own]
         return [at for at, _ in met], [found for _, found in met]
 
     # Other choices: a choice confirms itself, because the estimate follows it (see `graphloc.solve._choices`)
 
     def try_others(self) -> bool:
-        """Where measurements judged false agree with each other, try to believe them instead, and keep what is more probable.
+        """Where measurements judged false agree with each other, try to believe them, and keep what is more probable.
 
         Returns:
             Whether anything was tried.
@@ -249,7 +270,8 @@ class Judge:
             believed = [e.verdict.mode if e.held is not None and e.verdict.weight >= AGREES else None for e in own]
             others = [mode for mode, held in zip(chain, believed, strict=True) if mode != held]
             tried = frozenset((e.index, mode) for e, mode in zip(own, chain, strict=True))
-            # A single new one may agree with some of those believed, and contradict the others.
+            # A single other measurement may agree with some of the believed ones and contradict the rest: no reason for
+            # a trial.
             if len(others) < _CHAIN or all(mode is None for mode in others) or tried == self._tried.get(name):
                 continue
             self._tried[name] = tried
@@ -261,9 +283,13 @@ class Judge:
         return moved
 
     def _weigh_choices(self, stream: LiveStream) -> bool:
-        """Try the most probable choice of the newest measurements, and keep the spread of the others; return whether the estimate may have moved.
+        """Try the most probable choice of the newest measurements, and keep the spread of the others.
 
-        Only choices that believe something more are tried: that all are false is also the explanation for a frozen sensor.
+        Only a choice that believes a further measurement or another mode is tried: that measurements are false explains
+        a frozen sensor, too.
+
+        Returns:
+            Whether the estimate may have moved.
         """
         settled = False
         for tried in range(_ROUNDS):
@@ -292,9 +318,10 @@ class Judge:
         return True
 
     def _solved_without(self, stream: LiveStream, own: list[Entry]) -> list[Choice]:
-        """Return the choices (see `choices`) from the window solved without these measurements; none where it cannot be.
+        """Return the choices (see `choices`) from the window solved without the measurements `own`; none if that fails.
 
-        They are much more precise than all else together: linear algebra does not tell where that leaves the estimate.
+        It is for measurements much more precise than everything else together: linear algebra alone does not tell where
+        the estimate is without them.
         """
         self._window.settle()
         newest = keys.pose(self._problem.timeline.last)
@@ -315,9 +342,9 @@ class Judge:
             back()
 
     def _try(self, stream: LiveStream, own: list[Entry], others: list[Verdict]) -> None:
-        """Apply other verdicts and iterate; restore the window where that is less probable, or the solver diverges.
+        """Apply other verdicts and iterate; restore the window if that is less probable, or the solver fails.
 
-        Restored from a copy: from far off the steps of the solver would not lead back.
+        The window is restored from a copy: the solver's own steps would not lead back from far off.
         """
         self._window.settle()
         cost, agreement, back = self._cost(stream, own), self._agreement.marked(), self._entries.marked(own)
@@ -343,12 +370,15 @@ class Judge:
 
 
 def _spread(weighed: Sequence[Choice], cov: Array, *, moves: bool, unplaced: bool) -> tuple[Array, Array]:
-    """Return what choices add to the newest position, by their probability: mean (3,), m, and covariance (3, 3).
+    """Return what choices add to the newest position, by their probability: mean (3,), m, and covariance (3, 3), m^2.
+
+    Choices that leave the position hardly determined do not move the mean: their share of a step of 100 m is a position
+    that no choice means.
 
     Args:
-        weighed: the most probable one first. cov: joint one of the estimate, its newest position first.
-        moves: whether the present choice is the most probable one: only then the mean is moved (else that was tried and rejected), and
-            not by choices that leave the position undetermined: their share of a step of 100 m is no position that any means.
+        weighed: choices, the most probable one first. cov: joint covariance of the estimate, its newest position first.
+        moves: whether the present choice is the most probable one. If not, that one was tried and rejected, and the
+            mean stays.
         unplaced: see `choices`.
     """
     share, steps = np.exp([c.log for c in weighed]), np.array([c.step[:3] for c in weighed])
@@ -361,6 +391,10 @@ def _spread(weighed: Sequence[Choice], cov: Array, *, moves: bool, unplaced: boo
 
 
 def _more(cov: Array, than: Array) -> Array:
-    """Return by how much the covariance (3, 3) of the position in one joint covariance is larger than in another, along its own axes."""
+    """Return by how much the position's covariance (3, 3) in `cov` exceeds that in `than`, axis by axis; at least 0.
+
+    Args:
+        cov, than: joint covariances, position first.
+    """
     size, axes = np.linalg.eigh(cov[:3, :3] - than[:3, :3])
     return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)

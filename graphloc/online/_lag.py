@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sliding window: states are added, measurements taken, judged, judged again, and marginalised.
+"""The sliding window: states are added; measurements are taken, judged, judged again, and marginalised.
 
-This file is about the order of events: a commit, what comes before and after it, and whether to iterate. States
-(`_states`), measurements (`_entries`) and judging (`_judge`) have their own files; the judge changes entries by the predictions
-of the states, and neither of these knows the judge.
+This file orders the events: a commit, what comes before and after it, and whether to iterate. States (`_states`),
+measurements (`_entries`) and judging (`_judge`) have their own files. The judge changes entries by the predictions of
+the states; neither states nor entries know the judge.
 """
 
 from __future__ import annotations
@@ -35,12 +35,14 @@ from graphloc.solve.imu_noise import log_likelihood
 from graphloc.solve.warnings import noisier_warning
 from graphloc.solve.wrong_imu import most_motion
 
-# Of 9 squares: the median where the IMU agrees is below 0.2, where its noise is 3 times too small 1 to 10.
+# Median over IMU steps of a sum of 9 weighted squares: below 0.2 where the IMU agrees, 1 to 10 where its noise is 3
+# times too small.
 _STEP_COST = 1.0
 _STEP_M = 0.3  # a commit that moves the newest state by more is followed by further iterations
-# Share of the measurements that denied an estimate, that must agree with another; and of a sensor with outliers.
+# Share of a sensor's measurements since its denial that must agree with another estimate; the same of a sensor with
+# outliers.
 _EXPLAINED, _HALF = 0.8, 0.5
-_EITHER = 0.5  # probability that a receiver is right which matches contradict and never confirmed
+_EITHER = 0.5  # probability that a receiver is right which contradicts matches, where these were never confirmed
 _MOST_STEPS, _STANDS = 10, 0.1  # largest number of iterations; relative change of the cost at which they end
 
 
@@ -48,13 +50,14 @@ class Lag:
     """States and measurements of the last seconds, from an anchor on.
 
     Args:
-        lag_s: length of the window. guess: pose, velocity (3,) and bias (6,) to solve the first state at; default: the anchor's.
+        problem: what the factors are built from. anchor: estimate at the first state. lag_s: length of the window.
+        guess: pose, velocity (3,) and bias (6,) that the first state is first solved at; default: the anchor's.
 
     Raises:
         SolveError: by every method; the window cannot be used afterwards.
 
     Attributes:
-        problem: what the factors are built from.
+        problem, lag_s: as given.
     """
 
     def __init__(
@@ -84,14 +87,14 @@ class Lag:
         return self.problem.timeline.stamps_ns[self.problem.timeline.first]
 
     def grow(self, stamp_ns: int) -> bool:
-        """Stage the next state, predicted by the IMU; return whether slow states got a new node: then a commit is due."""
+        """Stage the next state, predicted by the IMU; return whether slow states got a new node: commit then."""
         return self._states.grow(stamp_ns)
 
     def reintegrate(self, holes: Sequence[tuple[int, int]]) -> None:
-        """Stage again what was integrated without IMU samples that came late.
+        """Integrate the IMU anew where samples came late, and stage the factors that depend on it.
 
         Args:
-            holes: of each such sample, the stamps (ns) of the samples before and after it.
+            holes: stamps (ns) of the samples before and after each late one.
         """
         timeline = self.problem.timeline
         stale = {k for a, b in holes for k in range(timeline.floor(a), timeline.floor(b) + 1)}
@@ -103,7 +106,7 @@ class Lag:
         timeline, window = self.problem.timeline, self._window
         pose, now_s = keys.pose(timeline.last), timeline.page_s(timeline.stamps_ns[timeline.last])
         self.fresh = now_s > self._page_s
-        if self.fresh:  # when a page is marginalised, everything is eliminated again anyway
+        if self.fresh:  # a page is marginalised: that eliminates everything again anyway
             self._page_s = now_s
             window.relinearise()
             self._entries.follow_solver()
@@ -118,7 +121,7 @@ class Lag:
         self._states.read()
 
     def _settle_down(self) -> None:
-        """Iterate until the cost no longer changes: after one step of metres, older states are further off than the newest."""
+        """Iterate until the cost stands still: after one step of metres, older states are worse than the newest."""
         cost = self._window.error()
         for _ in range(_MOST_STEPS):
             self._entries.follow_estimate()
@@ -133,7 +136,7 @@ class Lag:
         self._states.read()
 
     def follow(self, unmodelled: UnmodelledError) -> None:
-        """Bring what left-out slow errors and the IMU's mount do to the newest state up to date with it."""
+        """Bring the effect of left-out slow errors and of the IMU's mount up to the newest state."""
         if not unmodelled.due(self.newest.stamp_ns):
             return
         told = {}
@@ -143,7 +146,11 @@ class Lag:
         unmodelled.advance(self.newest, self.problem.links, told, self.problem.motion_model)
 
     def unmodelled(self, begun: BeforeStart | None = None, last: ErrorSizes | None = None) -> UnmodelledError | None:
-        """Return what left-out slow errors and the IMU's mount do to the newest state, as known from elsewhere (see `UnmodelledError.at`)."""
+        """Return the effect of left-out slow errors and of the IMU's mount on the newest state.
+
+        Args:
+            begun, last: what is known of it from before the window (see `UnmodelledError.at`).
+        """
         P = self._states.covariance([stream for stream, _ in estimated_beside(self.problem.streams)])
         return UnmodelledError.at(self.problem, self.newest, P, begun, last)
 
@@ -152,11 +159,11 @@ class Lag:
         return self._states.anchor()
 
     def track(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
-        """Return stamps (N,), ns, and in world positions (N, 3), attitudes (N, 3, 3) and velocities (N, 3) of the body's origin."""
+        """Return stamps (N,), ns; and positions (N, 3), attitudes (N, 3, 3), velocities (N, 3) of the body in world."""
         return self._states.track()
 
     def antennas_off_m(self) -> dict[str, Array]:
-        """Return how far from its mount each antenna is (3,), m, body axes, where that is estimated."""
+        """Return, by sensor, how far from its mount the antenna is (3,), m, body axes, where that is estimated."""
         streams = self.problem.streams.values()
         found = {s.name: antenna_off_m(corrections(self._constants.of(s), s.mount)) for s in streams}
         return {name: off_m for name, off_m in found.items() if off_m is not None}
@@ -168,7 +175,7 @@ class Lag:
     # Measurements
 
     def judged(self, sensor: str, after_ns: int, until_ns: int) -> list[tuple[Measurement, Residual]]:
-        """Return the measurements of a sensor with stamps from after one to another, by stamp, each with the residual of its mode."""
+        """Return a sensor's measurements with `after_ns` < stamp <= `until_ns`, each with the residual of its mode."""
         own = self._entries.of(self.problem.streams[sensor])
         return [(e.measurement, e.verdict.residual) for e in own if after_ns < e.measurement.stamp_ns <= until_ns]
 
@@ -177,17 +184,17 @@ class Lag:
         self._judge.take(m)
 
     def judge(self) -> None:
-        """Stage new decisions, and those that changed."""
+        """Stage the decisions on measurements that are new or have changed."""
         self._judge.judge()
 
     def try_others(self) -> None:
-        """Where measurements judged false agree with each other, try to believe them instead, and keep what is more probable."""
+        """Where measurements judged false agree with each other, try to believe them; keep what is more probable."""
         if self._judge.try_others():
             self._states.read()
 
     @property
     def others(self) -> tuple[Array, Array]:
-        """What other choices of modes, and the other level of a receiver that jumped, add to the newest position in world.
+        """What other choices of modes, and the other level of a receiver that jumped, add to the newest position.
 
         Mean (3,), m, and covariance (3, 3), m^2.
         """
@@ -201,7 +208,7 @@ class Lag:
     def contradicted(self) -> Array:
         """What receivers that contradict the matches add to the covariance (3, 3) of the newest position in world, m^2.
 
-        Where a receiver is right it has a slow error all the same, of the usual size.
+        A receiver that is right still has a slow error of the usual size; that is added, too.
         """
         doubted = self._agreement.doubted(self.problem.config.receiver_of)
         streams = self._off_squares() if doubted else ()
@@ -213,7 +220,7 @@ class Lag:
         return np.asarray(_EITHER * sum(either, np.zeros((3, 3))))
 
     def _off_squares(self) -> Iterator[tuple[LiveStream, Array]]:
-        """Yield each receiver with the square (3, 3), m^2, of how far off it is now by a slow error that may jump."""
+        """Yield each receiver whose slow error may jump, with the outer product (3, 3), m^2, of that error now."""
         timeline = self.problem.timeline
         for stream in self.problem.streams.values():
             if stream.slow is not None and stream.slow.far:
@@ -222,7 +229,7 @@ class Lag:
                 yield stream, np.outer(off_m, off_m)
 
     def inherit(self, before: Lag) -> None:
-        """Take over when each sensor last agreed; `before`: the window that this one replaces."""
+        """Take over what was noted of agreement with the window that this one replaces."""
         self._agreement.inherit(before._agreement)
 
     @property
@@ -232,7 +239,7 @@ class Lag:
 
     @property
     def lost_s(self) -> float:
-        """For how long (s) the estimate has been lost, by the absolute sensors; 0: it is not (see `_agreement.py`)."""
+        """For how long (s) the absolute sensors have shown the estimate to be lost; 0: not lost (`_agreement.py`)."""
         return self._agreement.lost_s(self.newest.stamp_ns)
 
     @property
@@ -253,9 +260,10 @@ class Lag:
         return lines
 
     def setting_warnings(self) -> list[str]:
-        """Return a warning on each delay or antenna's place that is clearly far from where it is set, newly or by twice as much as was said.
+        """Return a warning on each delay, and each antenna's place, that is clearly far from its setting.
 
-        What turns tell of an antenna grows with them: the first line may name a fifth of it.
+        A warning is repeated when the difference has doubled. The first one may name a fifth of it, because each turn
+        of the vessel tells more of an antenna.
         """
         lines = list[str]()
         for stream in self.problem.streams.values() if self.fresh else ():
@@ -267,16 +275,18 @@ class Lag:
 
     @property
     def unmodelled_jumps(self) -> list[str]:
-        """Names of the receivers that have jumped since the window was built, where the window can estimate that as their error."""
+        """Names of the receivers that have jumped since the window was built, and whose jumps a window can estimate."""
         streams = self.problem.streams.items()
         return [n for n, s in streams if s.may_jump and s.receiver.jump.jumps != s.jumps]
 
     def in_doubt(self, stamp_ns: int) -> str:
         """Return why the health cannot be good at a stamp; empty where nothing is wrong.
 
-        The only position sensor has jumped, scans are stamped far off, or a sensor agrees only by a slow error that is unlikely so large.
+        It cannot be good where the only position sensor has jumped, scans are stamped far off, or a sensor agrees only
+        by an unlikely large slow error.
         """
-        streams = self.problem.streams.items()  # where a slow error is left out, the bounds include it
+        streams = self.problem.streams.items()
+        # Where a receiver's slow error is left out, and no jump is estimated, the bounds include its jumps.
         doubtful = [
             n
             for n, s in streams
@@ -291,7 +301,10 @@ class Lag:
         return "; ".join([*map(why_in_doubt, doubtful), *map(why_late, late), *map(why_unlikely, unlikely)])
 
     def _settled_ns(self, name: str) -> int:
-        """Return when last another sensor of position agreed: of those that read the same receiver by turns, one of smaller slow error (RTK); 0: none has."""
+        """Return the stamp (ns) at which another sensor of position agreed last; 0: none has.
+
+        Of the sensors that read the same receiver by turns, only those with a smaller slow error (RTK) count.
+        """
         own, streams = self.problem.streams[name], self.problem.streams
         beside = [streams[other] for other in self.problem.config.by_turns(name)[1:] if other in streams]
         better = [s for s in beside if s.slow and own.slow and s.slow.sigma[0] < own.slow.sigma[0]]
@@ -300,13 +313,13 @@ class Lag:
 
     @property
     def denied(self) -> Mapping[str, int]:
-        """Stamps of the first denials of sensors that deny the estimate together (see `_imu_doubt.Denials`)."""
+        """Stamps (ns) of the first denials of sensors that deny the estimate together (see `_imu_doubt.Denials`)."""
         return self._judge.denials.at_once(self.newest.stamp_ns)
 
     def explained(self, sensors: Collection[str], since_ns: int) -> bool:
-        """Return whether the measurements of some sensors since a stamp now agree, and by a motion that a vessel may have made.
+        """Return whether measurements since a stamp now agree, by a motion that a vessel may have made.
 
-        Of two of them at least, and of all but those with outliers.
+        At least two of the sensors must agree, among them all that have no hypotheses.
         """
         agreeing = 0
         for stream in map(self.problem.streams.__getitem__, sensors):
@@ -319,24 +332,26 @@ class Lag:
         return agreeing >= 2 and 2.0 * self._states.steps_cost(since_ns) <= most_motion(lasts_s)
 
     def gone(self) -> list[LedgerRow]:
-        """Return ledger rows of measurements that have left since this was last called."""
+        """Return the ledger rows of measurements that have left the window since the last call."""
         return self._entries.gone()
 
     def held(self) -> list[LedgerRow]:
-        """Return ledger rows of the measurements in the window, as judged now."""
+        """Return the ledger rows of the measurements in the window, as judged now."""
         return self._entries.held()
 
     def likelihoods(self, times: Sequence[tuple[float, float]]) -> Array:
-        """Return the log-likelihoods of the window if the noise of gyroscope and accelerometer is so many times as large."""
+        """Return the log-likelihood of the window for each pair of factors on gyroscope and accelerometer noise."""
         links = self._states.links()
         J, b = self._window.linear(links)
         return np.array([log_likelihood(J, b, len(links), *each) for each in times])
 
     def misfit(self) -> float:
-        """Return the cost of the window over its expectation (see `solve._passes.expected_cost`); 1 where the IMU agrees.
+        """Return the cost of the window over its expectation (see `solve._passes.expected_cost`).
 
-        A GNSS jump, or a step that is not relinearised yet, may cost as much as IMU noise that is configured too small, but not in
-        most of the IMU's steps.
+        It is 1 where most IMU steps cost little.
+
+        A GNSS jump, or a step that is not relinearised yet, may cost as much as IMU noise that is configured too small.
+        But unlike that, it does not make most of the IMU's steps costly.
         """
         if 2.0 * self._states.step_cost() < _STEP_COST:
             return 1.0

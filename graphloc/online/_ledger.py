@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ledger rows online: each measurement gets exactly one, also where a window is rebuilt."""
+"""Ledger rows online: each measurement gets exactly one, even where a window is rebuilt."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graphloc.measurements import Measurement
 
 
 class OnlineLedger:
-    """Rows that have become final, and the measurements that have theirs: these are not used again in a rebuilt window."""
+    """Rows that have become final, and which measurements have one: a rebuilt window does not use these again."""
 
     def __init__(self, config: VesselConfig) -> None:
         self._config = config
@@ -19,16 +19,16 @@ class OnlineLedger:
         self._settled: set[int] | None = None  # None: there is no window, so nothing can be used again
 
     def taken(self) -> list[LedgerRow]:
-        """Return the rows since this was last called."""
+        """Return the rows that were entered since the last call."""
         rows, self._rows = self._rows, []
         return rows
 
     def begin(self) -> None:
-        """There is a window from now on (or still)."""
+        """Begin a window, or continue with a rebuilt one."""
         self._settled = self._settled or set()
 
     def close(self) -> None:
-        """There is no window any more."""
+        """End the window: no measurement can be used again."""
         self._settled = None
 
     def has(self, m: Measurement) -> bool:
@@ -36,7 +36,7 @@ class OnlineLedger:
         return m.seq in (self._settled or ())
 
     def forget_but(self, seqs: Collection[int]) -> None:
-        """Forget all measurements but these: the others are too old to be used again."""
+        """Forget which measurements have a row, except for numbers `seqs`: the others are too old to be used again."""
         if self._settled is not None:
             self._settled.intersection_update(seqs)
 
@@ -47,7 +47,7 @@ class OnlineLedger:
             self._settled.update(row.seq for row in rows)
 
     def drop(self, m: Measurement, outcome: Outcome, reason: str) -> None:
-        """Enter why a measurement is not in the estimate; synthetic ones (seq < 0) have no row."""
+        """Enter why a measurement is not in the estimate; synthetic measurements (seq < 0) have no row."""
         if m.seq >= 0:
             self.enter([self._row(m, outcome, reason)])
 

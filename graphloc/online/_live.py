@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The online problem: it grows at its end and is forgotten from its beginning (offline: `graphloc.build.Problem`)."""
+"""The online problem: it grows at its end, and its beginning is forgotten (offline: `graphloc.build.Problem`)."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from graphloc.signals.position_jumps import JumpDetector, PositionJump
 from graphloc.time import NS_PER_S, duration_ns
 
 T = TypeVar("T")
-_USUAL = 16  # the last measurements, by which it is taken how far apart they usually come
+_USUAL = 16  # newest measurements, which tell how far apart they usually come
 _PAGE_S = 1.0  # states are marginalised in pages of this length
 
 
@@ -84,8 +84,9 @@ class LiveTimeline:
     """States on a regular grid from `start_ns` on, and the slow nodes among them.
 
     Args:
-        jumps_ns: stamps of the first fixes after position jumps. A slow node begins at the state of each: the fixes of a node
-            share their slow error, those before and after a jump do not.
+        config: rates of states and slow nodes. start_ns: stamp of the first state.
+        jumps_ns: stamps of the first fixes after position jumps. A slow node begins at the state of each, because fixes
+            that share a slow node share their slow error, and fixes before and after a jump do not.
     """
 
     def __init__(self, config: TimelineConfig, start_ns: int, jumps_ns: Collection[int]) -> None:
@@ -102,7 +103,7 @@ class LiveTimeline:
 
     @property
     def first(self) -> int:
-        """Number of the oldest state that is not forgotten."""
+        """Number of the oldest state that is kept."""
         return self.stamps_ns.first
 
     @property
@@ -119,9 +120,9 @@ class LiveTimeline:
         return (stamp_ns - self._start_ns) * 1e-9
 
     def page_s(self, stamp_ns: int) -> float:
-        """Return the time (s) that the window keeps for the keys of a stamp: the same for a whole page.
+        """Return the time (s) by which the window marginalises the keys of a stamp: it is the same for all of a page.
 
-        Marginalising keys eliminates all newer ones again; so it is done once per second, and not at every state.
+        Marginalising keys eliminates all newer ones again; so it is done once per page, and not at every state.
         """
         return float(np.ceil(self.seconds(stamp_ns) / _PAGE_S)) * _PAGE_S
 
@@ -140,7 +141,7 @@ class LiveTimeline:
         self.slow_stamps_ns.forget(self.slow_of[before])
 
     def attached_until_ns(self, stamp_ns: int) -> int:
-        """Return the stamp of the last measurement that would attach to a state at a stamp, by `nearest`."""
+        """Return the latest stamp that a measurement may have to attach, by `nearest`, to a state at `stamp_ns`."""
         return stamp_ns + self._period_ns // 2
 
     def nearest(self, stamp_ns: int) -> int:
@@ -151,22 +152,22 @@ class LiveTimeline:
         return self.first + (left if stamp_ns - kept[left] <= kept[right] - stamp_ns else right)
 
     def floor(self, stamp_ns: int) -> int:
-        """Return the number of the last state at or before a stamp (of the first one for stamps before it)."""
+        """Return the number of the last state at or before a stamp; of the oldest one, if the stamp lies before it."""
         return self.first + max(bisect_right(self.stamps_ns.kept, stamp_ns) - 1, 0)
 
 
 @dataclass(slots=True, eq=False)
 class ReceiverDetectors:
-    """Detectors of what a receiver repeats, fixes or velocities, of its position jumps and wrong settings; they outlive the window."""
+    """Detectors of a receiver's repetitions, position jumps and wrong settings; they outlive the window."""
 
     repeated_fix: RepeatedFixDetector = field(default_factory=RepeatedFixDetector)
     repeated_velocity: RepeatedVelocityDetector = field(default_factory=RepeatedVelocityDetector)
     jump: JumpDetector = field(default_factory=JumpDetector)
     far_off: dict[str, float] = field(default_factory=dict)
-    """Settings of which it was said that they are far from the estimate, and by how much it was."""
+    """Settings that users were warned of as far from the estimate, and by how much they were off then."""
 
     def forget(self) -> None:
-        """Forget what is by the estimate, which is given up; not the levels of the fixes: a restart makes none of them right."""
+        """Forget what was found with the estimate, which is given up; a restart does not change levels of fixes."""
         self.repeated_fix, self.repeated_velocity = RepeatedFixDetector(), RepeatedVelocityDetector()
         self.jump.forget()
 
@@ -177,15 +178,17 @@ class LiveStream:
 
     Attributes:
         number, name, row, config, constants, mount, shares, without_height: as of a `build.Stream`.
-        slow: the slow error that is estimated. left_out: the one that is added to the bounds instead, because no second sensor
-            separates it from motion; both, once the receiver has jumped: then the window estimates its jumps.
-        measurements, state, carry, gyro_radps, felt, apart_s: as of a `build.Stream`, by order of arrival; the window forgets the first.
+        slow: the slow error that is estimated. left_out: the slow error that is added to the bounds instead, because no
+            second sensor separates it from motion. Once the receiver has jumped there are both: the window then
+            estimates its jumps alone.
+        measurements, state, carry, gyro_radps, felt, apart_s: as of a `build.Stream`, by order of arrival; the oldest
+            are forgotten.
         by_stamp: stamps (ns) and indices of the measurements that are kept, by stamp.
         scatter: by what factor its residuals scatter more than stated.
-        frozen_detector: whether its position stays while the estimate moves; a restart forgets it.
+        frozen_detector: finds that its position stays while the estimate moves; a new window begins with a new one.
         receiver: detectors that outlive the window.
         jumps: position jumps that the window estimates.
-        told_ns: the newest stamp of its measurements. anew_ns: that of the newest before its slow error was last drawn anew; None: it
+        told_ns: newest stamp of its measurements. anew_ns: `told_ns` when its slow error was last drawn anew; None: it
             never was.
     """
 
@@ -215,7 +218,7 @@ class LiveStream:
 
     @property
     def frozen(self) -> bool:
-        """Whether it is a receiver that repeats one position while the vessel moves."""
+        """Whether the receiver repeats one position while the vessel moves."""
         return self.frozen_detector.frozen or self.receiver.repeated_fix.frozen
 
     @property
@@ -225,14 +228,14 @@ class LiveStream:
 
     @property
     def noisier(self) -> float:
-        """Factor on its stated sigma; 1 for positions, whose scatter may be that of the estimate."""
+        """Factor on the stated sigma; 1 for a sensor of position: its residuals may scatter by the estimate's error."""
         return 1.0 if self.row.absolute else self.scatter.noisier
 
     def space(self) -> None:
-        """Note how far apart measurements are at the one taken last, and anew at those after it, if it came late.
+        """Note how far apart measurements come at the one taken last; also anew at those after it, if it came late.
 
-        Where each comes up to 2 s late, the newest are every second one or so: taken to be so far apart for good, each would count
-        for more than it tells.
+        Where measurements come up to 2 s late and out of order, about half of the newest are still missing. If the
+        distance of the others were final, each would count for more than it tells.
         """
         index = len(self.measurements) - 1
         taken = (self.measurements[index].stamp_ns, index)
@@ -246,7 +249,7 @@ class LiveStream:
             self.apart_s[around[n][1]] = float(apart_s[n])
 
     def drawn_anew(self, stamp_ns: int) -> bool:
-        """Return whether its slow error is drawn anew at a stamp: once as it has been silent for so long."""
+        """Return whether the slow error is drawn anew at a stamp, after a long silence; True once per silence."""
         silent_ns = stamp_ns - self.told_ns
         if self.slow is None or self.told_ns == self.anew_ns or silent_ns <= self.slow.anew_after_s * NS_PER_S:
             return False
@@ -263,7 +266,10 @@ class LiveStream:
             tape.forget(before)
 
     def jumped(self, after_ns: int, until_ns: int) -> tuple[float, Array | None]:
-        """Return the size (m) of the largest jump in an interval (stamps, ns), and what slow error (k,) all of them make; 0, None: no jump."""
+        """Return the largest jump (m) with `after_ns` < stamp <= `until_ns`, and the slow error (k,) that all add.
+
+        0 and None where there is no jump.
+        """
         found = [j for j in self.jumps if after_ns < j.after_ns <= until_ns]
         if self.slow is None or not found or not self.slow.far:
             return 0.0, None
@@ -274,11 +280,13 @@ class LiveStream:
 
 @dataclass(slots=True, eq=False)
 class LiveProblem:
-    """A problem that grows and forgets; what `build.attach` needs of it is as of a `build.Problem`.
+    """A problem that grows and forgets. It has the attributes that `build.attach` needs, as a `build.Problem` has them.
 
     Attributes:
-        t_body_imu_m, R_body_imu: (3,), (3, 3) mount of the IMU in body. imu_mount_sigma_rad: by how much it may be turned, each axis.
-        links: preintegration of the IMU. streams: by name of the sensor.
+        config: the vessel. datum: origin of world. timeline: states and slow nodes.
+        t_body_imu_m, R_body_imu: (3,), (3, 3) mount of the IMU in body. imu_mount_sigma_rad: 1 sigma of its rotation,
+            each axis.
+        links: preintegration of the IMU. streams: by name of the sensor. motion_model: for outages.
     """
 
     config: VesselConfig
@@ -303,7 +311,7 @@ class LiveProblem:
         timeline = self.timeline
         floor, nearest = timeline.floor(m.stamp_ns), timeline.nearest(m.stamp_ns)
         stream.measurements.append(m)
-        if stream.told_ns == stream.anew_ns:  # till now the place was by the level before
+        if stream.told_ns == stream.anew_ns:  # until now the position was by the slow error before the silence
             stream.receiver.jump.drawn_anew(m.stamp_ns)
         stream.told_ns = max(stream.told_ns, m.stamp_ns)
         stream.space()
@@ -314,13 +322,18 @@ class LiveProblem:
         return stream, len(stream.measurements) - 1
 
     def reintegrate(self, stream: LiveStream, index: int) -> None:
-        """Integrate again from the state before a measurement to its stamp: samples in between came late."""
+        """Integrate the IMU again from the state before a measurement to its stamp: samples in between came late."""
         stream.carry[index], stream.gyro_radps[index], stream.felt[index] = self._motion(
             stream, stream.measurements[index].stamp_ns
         )
 
     def _motion(self, stream: LiveStream, stamp_ns: int) -> tuple[Carry | None, Array, Array]:
-        """Return the motion from the state before a stamp to it (None at a state), the raw angular rate there (3,), rad/s, and what is felt (6,)."""
+        """Return the motion by the IMU at a stamp.
+
+        Returns:
+            The motion from the state before the stamp to it, None at a state; the raw angular rate (3,), rad/s; and
+            `felt` (6,), as of a `build.Stream`.
+        """
         floor = self.timeline.floor(stamp_ns)
         at_ns = self.timeline.stamps_ns[floor]
         carry = None
@@ -346,8 +359,10 @@ def live_problem(
     """Return a problem whose first state is at `start_ns`.
 
     Args:
-        imu: the samples known from there on. imu_config: with the noise that they have, up to `noise_scale`.
-        receivers: by sensor; missing ones are added.
+        setup: of the online mode. datum: origin of world.
+        imu: the samples known from `start_ns` on. imu_config: configuration of the IMU, with the noise that the samples
+            have but for `noise_scale`, a further factor on it.
+        motion_model: for outages. receivers: detectors, by sensor; missing ones are added.
         slow_known: names of the sensors whose slow error is known at the start.
     """
     config, by_name = setup.config, rows_of(setup.config, setup.rows)
@@ -390,7 +405,9 @@ def _live_stream(
     """Return the stream of a sensor, without measurements.
 
     Args:
-        company: how many sensors can separate each other's slow errors from motion. known: its slow error is, at the start.
+        rows: row of the table of sensors, by name of the sensor. t_body_imu_m: (3,) place of the IMU in body.
+        company: how many sensors can separate each other's slow errors from motion. known: whether its slow error is
+            known at the start.
     """
     config, row = setup.config.sensors[name], rows[name]
     constants, shares = shared_constants(name, setup.config, rows)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of the IMU: raised where the IMU contradicts the other sensors, and where its samples scatter more and what is measured bears that out."""
+"""Noise of the IMU: raised where the IMU contradicts the other sensors.
+
+It is also raised to the scatter of its samples, where that makes all measurements together more probable.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +18,21 @@ from graphloc.online._lag import Lag
 from graphloc.solve.imu_noise import CONTRADICTION, LARGEST_NOISE_SCALE, LEAST_TIMES, noise_step, scattered, too_quiet
 
 _EVERY_S, _MISFITS = 5.0, 2  # how often the fit is checked, and how many checks in a row must fail
-_WINDOWS_S = 10.0  # how often a larger noise is tried, where the lag is no longer
-_SURE = 8.0  # log-likelihood that it must gain
+_WINDOWS_S = 10.0  # how often a larger noise is tried; less often if the lag is longer
+_SURE = 8.0  # log-likelihood that a larger noise must gain
 
 
 class ImuNoise:
-    """Factors on the configured noise densities; but for the walk of the biases they only grow.
+    """Factors on the configured noise densities. They only grow, but for those on the walk of the biases.
 
     Args:
-        adapt: whether they may grow (`adapt_noise`).
+        adapt: whether the factors may change (`adapt_noise`).
 
     Attributes:
-        scale: of both, at least 1. gyro, accel: beside it, of each. walk: those on the walk of the biases.
-        misled: how many times larger the covariance of an estimate is to be that had less of this walk; 1: `changed` raised none.
+        scale: factor on all of the noise, at least 1. gyro, accel: further factors on the noise of each.
+        walk: factors on the walk of the biases.
+        misled: factor by which the last call of `changed` raised the walk, and by which covariances of earlier
+            estimates are to be enlarged; 1: it raised none.
     """
 
     def __init__(self, *, adapt: bool) -> None:
@@ -35,31 +40,33 @@ class ImuNoise:
         self.walk, self.misled = BiasWalk(), 1.0
         self._adapt = adapt
         self._looked_ns, self._misfits, self._weighed_ns = 0, 0, 0
-        self._gained = np.zeros(3)  # log-likelihood by a larger noise of both, of the gyroscope, of the accelerometer
+        # Log-likelihood gained by more noise of both, of the gyroscope, of the accelerometer
+        self._gained = np.zeros(3)
 
     def begin(self, at_ns: int) -> None:
-        """A window has begun at a stamp: it is not checked until it has settled."""
+        """Begin with a window that begins at a stamp: it is not checked until it has settled."""
         self._looked_ns, self._misfits, self._weighed_ns = at_ns, 0, at_ns
         self.walk.begin()
 
     def at_least(self, scale: float, gyro: float, accel: float, *walk: float) -> None:
-        """Raise the factors to those that are known from elsewhere: of a start, or of a snapshot."""
+        """Raise the factors to known ones: those of a start, or of a snapshot."""
         if not self._adapt:
             return
         self.walk.times = np.maximum(self.walk.times, walk or 1.0)
         self.scale, self.gyro, self.accel = max(self.scale, scale), max(self.gyro, gyro), max(self.accel, accel)
 
     def of(self, sensor: Any) -> Any:
-        """Return the configuration of the IMU with its noise raised but for the scale."""
+        """Return the configuration of the IMU with its noise and walk raised, but not by `scale`."""
         return noisier_imu(self.walk.of(sensor), self.gyro, self.accel)
 
     def changed(self, lag: Lag, samples: Callable[[], ImuSeries], *, heading_doubtful: bool = False) -> str:
         """Raise the noise where that is needed, or lower the walk again; return a line on that, or empty.
 
         Args:
-            samples: gives those of the window. heading_doubtful: the heading may be wrong: that bends the biases as well.
+            samples: gives the IMU samples of the window. heading_doubtful: whether the heading may be wrong, which
+                bends the biases.
         """
-        # Until relinearised, the cost of a step includes how far its states have moved since.
+        # Before a relinearisation, the cost of a step includes how far its states have moved since the last one.
         if not self._adapt or not lag.fresh:
             return ""
         self.misled, before = 1.0, self.walk.times.copy()
@@ -85,12 +92,15 @@ class ImuNoise:
         return f"the IMU contradicts the other sensors: its noise is scaled up to {self.scale:.1f} times"
 
     def _too_quiet(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
-        """Raise the noise to what the samples scatter, where that makes what was measured more probable (see `solve.imu_noise`).
+        """Raise the noise to the scatter of the samples, where the measurements are then more probable.
 
-        Not by the IMU's residuals alone, as offline: in a window of seconds, the prior of the data before it takes up most of a misfit.
+        See `solve.imu_noise`.
+
+        The IMU's residuals alone do not tell it, as they do offline: in a window of seconds, the prior from earlier
+        data takes up most of a misfit.
         """
         at_ns = lag.newest.stamp_ns
-        if at_ns - self._weighed_ns < max(_WINDOWS_S, lag.lag_s) * 1e9:  # no data count twice
+        if at_ns - self._weighed_ns < max(_WINDOWS_S, lag.lag_s) * 1e9:  # so that no data count twice
             return ""
         self._weighed_ns = at_ns
         imu = samples()
@@ -101,11 +111,12 @@ class ImuNoise:
         times = ((1.0, 1.0), (gyro, accel), (gyro, 1.0), (1.0, accel))
         try:
             likely = lag.likelihoods(times)
-        except RuntimeError:  # not determined by normal equations; the window stands
+        except RuntimeError:  # the normal equations are singular; the window itself is not affected
             return ""
         if not np.isfinite(likely).all():
             return ""
-        # Hours in which it was less probable must not hide for hours that it is more probable now.
+        # Limited from below: else hours in which more noise was less probable would hide for hours that it is needed
+        # now.
         self._gained = np.maximum(self._gained + likely[1:] - likely[0], -_SURE)
         best = int(np.argmax(self._gained))
         if self._gained[best] < _SURE:

@@ -2,8 +2,8 @@
 """The `odom` frame of REP 105: IMU steps added up and never corrected, so that the pose in it never jumps.
 
 A step is the propagation of the newest state by the IMU, with velocity and bias as estimated then. Corrections in world
-change the next step, not the last pose. Roll and pitch are pulled slowly towards those in world, which do not drift; by the
-gyroscope alone they would.
+change the next step, not the last pose. Roll and pitch are pulled slowly towards those in world, which do not drift; by
+the gyroscope alone they would.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import numpy as np
 
 from graphloc.frames import Array
 
-_LEAN_S = 5.0  # time constant with which its tilt follows the estimate's; a choice
-_LEAN_RAD = 2e-3  # at most, in a step: no jump
-_FLOOR = np.diag([1e-6] * 3 + [1e-8] * 3)  # of a step: errors of the integration itself
+_LEAN_S = 5.0  # time constant with which roll and pitch in odom follow those in world; a choice
+_LEAN_RAD = 2e-3  # largest such correction in a step, so that the pose does not jump
+_FLOOR = np.diag([1e-6] * 3 + [1e-8] * 3)  # smallest covariance of a step: errors of the integration itself; m^2, rad^2
 
 
 class Odometry:
-    """Pose of the body in `odom`, and the stamp up to which it is integrated: also after a rebuild no stretch counts twice.
+    """Pose of the body in `odom`, and the stamp that it has reached: after a rebuild, no stretch counts twice.
 
     Attributes:
-        stamp_ns: of the pose. p_m: (3,), R: (3, 3) body -> odom.
+        stamp_ns: of the pose. p_m: (3,), m, in odom. R: (3, 3) body -> odom.
         step_cov: (6, 6) of the motion since `begin`: position (m), then rotation (rad), axes of odom.
     """
 
@@ -35,7 +35,7 @@ class Odometry:
         self.step_cov = np.array(_FLOOR)
 
     def after(self, dp_body_m: Array, dR: Array) -> tuple[Array, Array]:
-        """Return the pose (3,), (3, 3) a step later; the step is in the axes of the body before it."""
+        """Return the pose (3,), (3, 3) after a step, which is given in the axes of the body before it."""
         return self.p_m + self.R @ dp_body_m, self.R @ dR
 
     def step(
@@ -51,14 +51,16 @@ class Odometry:
         """Add a step.
 
         Args:
-            until_ns: its end. dt_s: how long it took. dp_body_m, dR: as above. R_world_body: the map's attitude after it.
-            v_cov_body: (3, 3) of the velocity before it. noise: (6, 6) of the IMU over it: rotation, place, body axes.
+            until_ns: stamp of its end. dt_s: its duration. dp_body_m, dR: (3,), (3, 3) as of `after`.
+            R_world_body: (3, 3) attitude in world after it. v_cov_body: (3, 3) covariance of the velocity before it,
+                body axes.
+            noise: (6, 6) covariance by the IMU's noise over it: rotation, then position, body axes.
         """
         cov = np.array(_FLOOR)
         cov[:3, :3] += self.R @ (dt_s**2 * v_cov_body + noise[3:, 3:]) @ self.R.T
         cov[3:, 3:] += self.R @ noise[:3, :3] @ self.R.T
         self.p_m, R = self.after(dp_body_m, dR)
-        up = R @ R_world_body[2]  # up as estimated in world, seen in odom; it should be z there, too
+        up = R @ R_world_body[2]  # world's up by the estimate, in axes of odom; it should be the z axis
         # up x z written out: `np.cross` takes as long as all else here.
         lean = np.array([up[1], -up[0], 0.0]) * min(dt_s / _LEAN_S, 1.0)
         size = float(np.linalg.norm(lean))
@@ -66,6 +68,6 @@ class Odometry:
         R = gtsam.Rot3.Expmap(lean).matrix() @ R
         self.R = R @ (
             1.5 * np.eye(3) - 0.5 * R.T @ R
-        )  # a rotation still, after a day of steps: Newton's step to the nearest one
+        )  # Newton's step to the nearest rotation: rounding adds up over a day of steps
         cov[3:, 3:] += size**2 * 0.1 * np.eye(3)
         self.stamp_ns, self.step_cov = until_ns, self.step_cov + cov

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known beyond the sliding window: kept when the window is rebuilt, when the estimate restarts and, in part, in the snapshot."""
+"""State outside the sliding window: kept in a rebuild, in a restart and, in part, in the snapshot."""
 
 from __future__ import annotations
 
@@ -31,16 +31,18 @@ class PersistentState:
 
     Attributes:
         datum: origin of world; None before it is known.
-        noise: by how much the IMU's noise is raised. sensor_noise: factors of sensors that scatter more than they state.
+        noise: by how much the IMU's noise is raised. sensor_noise: factors on the sigmas of sensors that scatter more
+            than they state.
         heights_m: configured heights (m, up in world), by the name of the sensor that measures them.
-        heading: where no sensor measures it, how far it may be off; None: one does, or the motion has confirmed it.
+        heading: how far the heading may be off where no sensor measures it; None: one does, or the motion has confirmed
+            it.
         agreed_ns: stamp at which each absolute sensor last agreed, as known when the last window ended.
         odometry: the `odom` frame; None before the first start.
-        motion_model: motion model. heading_check: whether the heading fits the motion.
-        receivers: detectors of what a receiver repeats, and of its position jumps, by sensor.
-        clocks: of the sensors, by name, put right where they are set.
-        frozen: receivers that were last reported as frozen.
-        unmodelled: what slow errors that are left out, and the IMU's mount, do to the newest state; None where there is nothing of that.
+        motion_model: for outages. heading_check: whether the heading fits the motion.
+        receivers: detectors of repeated fixes and velocities, and of position jumps, by sensor.
+        clocks: by sensor; they correct stamps where a sensor's clock is set in mid-run.
+        frozen: names of the receivers that were last reported as frozen.
+        unmodelled: effect of left-out slow errors and of the IMU's mount on the newest state; None: there is none.
     """
 
     datum: Datum | None
@@ -59,10 +61,10 @@ class PersistentState:
 
     @classmethod
     def resumed(cls, found: Snapshot, noise: ImuNoise, sensors: Mapping[str, Any]) -> PersistentState:
-        """Return what a snapshot holds.
+        """Return the state that a snapshot holds.
 
         Args:
-            noise: raised as the snapshot's is. sensors: the enabled ones, by name: their configuration.
+            noise: of the IMU; it is raised to the snapshot's. sensors: configuration of the enabled sensors, by name.
         """
         noise.at_least(*found.noise)
         persistent = cls(
@@ -89,10 +91,11 @@ class PersistentState:
         return persistent
 
     def snapshot(self, setup: Setup, anchor: Anchor, imu: ImuSample, agreed_ns: Mapping[str, int]) -> Snapshot:
-        """Return what a run can resume from after its process was killed.
+        """Return the snapshot from which a run can resume after its process was killed.
 
         Args:
-            anchor: the newest state. imu: the sample at it or before. agreed_ns: as in the window.
+            setup: of the online mode. anchor: the state to resume at. imu: the last sample at or before it.
+            agreed_ns: stamp at which each absolute sensor last agreed with the window.
         """
         assert self.datum is not None
         assert self.odometry is not None
@@ -114,12 +117,12 @@ class PersistentState:
         )
 
     def forget_receivers(self) -> None:
-        """Forget position jumps and repeated fixes, which are by the estimate."""
+        """Forget position jumps and repetitions of receivers: they were found with the estimate, which is given up."""
         for receiver in self.receivers.values():
             receiver.forget()
 
     def forget_clock(self, stamp_ns: int) -> None:
-        """Forget stamps of a clock that was set back; `stamp_ns`: by the clock as it is now."""
+        """Forget stamps of a clock that was set back; `stamp_ns`: the stamp now, by that clock."""
         self.agreed_ns, self.receivers = {}, {}
         self.sensor_noise.forget_clock()
         if self.odometry is not None:

@@ -17,10 +17,10 @@ from graphloc.online._states import Newest, propagated_covariance
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Propagated:
-    """A state at some stamp.
+    """The newest state, or its propagation by the IMU.
 
     Attributes:
-        pose, velocity: at the IMU with the body's axes, in world: gtsam.Pose3 and (3,), m/s.
+        stamp_ns: of the state. pose, velocity: at the IMU with the body's axes, in world: gtsam.Pose3 and (3,), m/s.
         pose_cov: (6, 6), rotation first, in the body tangent. velocity_cov: (3, 3), in world.
         p_odom_m, R_odom_body: (3,) and (3, 3), pose of the body's origin in odom.
     """
@@ -68,7 +68,7 @@ def propagate(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns
 
 
 def advance_odometry(odometry: Odometry, problem: LiveProblem, newest: Newest, until_ns: int) -> None:
-    """Propagate the odometry by the IMU to a stamp: from the newest state, or from where it has already got to."""
+    """Propagate the odometry by the IMU to a stamp, from the newest state or the odometry's own, if that is later."""
     links, bias, before_ns = problem.links, newest.bias, newest.stamp_ns
     if until_ns <= odometry.stamp_ns:
         return
@@ -85,7 +85,11 @@ def advance_odometry(odometry: Odometry, problem: LiveProblem, newest: Newest, u
 
 
 def _body_step(problem: LiveProblem, a: gtsam.Pose3, b: gtsam.Pose3) -> tuple[Array, Array]:
-    """Return the step of the body's origin (3,) and its rotation (3, 3), in the body's axes before it; a, b: poses at the IMU."""
+    """Return the step of the body's origin (3,) and the rotation (3, 3) from pose a to pose b, in the body's axes at a.
+
+    Args:
+        a, b: poses at the IMU with the body's axes, in world.
+    """
     lever = -problem.t_body_imu_m
     R = a.rotation().matrix()
     dp = R.T @ (b.transformFrom(lever) - a.transformFrom(lever))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of each position receiver before its fixes are judged: does it repeat a fix, is it frozen, does its position jump?"""
+"""Checks of each receiver before its fixes are judged: does it repeat a fix, is it frozen, does its position jump?"""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from graphloc.signals.position_jumps import (
 )
 from graphloc.time import NS_PER_S, duration_ns
 
-_FITS = 3.0  # sigmas of a fix alone
+_FITS = 3.0  # sigmas of a fix alone, within which no prediction is needed
 FROZEN_ONLINE = f"{FROZEN}: it repeats one position while the vessel moves"
 _OLD = "it repeats the fix before it while the vessel moves"
 _OFF = "off what the IMU predicts: an outlier, or a position jump too short to tell"
 
 
 class ReceiverChecks:
-    """Feeds the detectors of each stream whose single positions are never false altogether (GNSS).
+    """Feeds the detectors of each stream without hypotheses (GNSS), and rejects measurements by what they find.
 
     Args:
-        agreement: told where a receiver turns out to be frozen.
+        problem, states, entries: of the window. agreement: it is told where a receiver turns out to be frozen.
     """
 
     def __init__(self, problem: LiveProblem, states: States, entries: Entries, agreement: Agreement) -> None:
@@ -45,10 +45,10 @@ class ReceiverChecks:
         self._warnings: list[str] = []
 
     def reject(self, stream: LiveStream, m: Measurement, at: Attachment, residual: Residual) -> str:
-        """Return why a measurement is left out; empty: it is not.
+        """Return why a measurement is left out; empty: it is used.
 
-        It repeats an old fix, is of a frozen receiver, or may be the beginning of a jump. A jump that is found has the window rebuilt, and
-        the fixes since its beginning with it.
+        It is left out if it repeats an old fix or velocity, is of a frozen receiver, or may begin a jump. Once a jump
+        is found, the window is rebuilt with the fixes since its beginning.
         """
         if stream.row.false is not None:
             return ""
@@ -74,7 +74,7 @@ class ReceiverChecks:
 
     def _repeats(self, stream: LiveStream, m: Measurement, at: Attachment, told_m: Array, antenna_mps: Array) -> bool:
         newest, detector = self._states.newest, stream.receiver.repeated_fix
-        # The antenna swings in waves, and the vessel may turn about it.
+        # The slower of IMU and antenna: the antenna swings in waves, and the vessel may turn about it.
         slower_mps = min(newest.velocity, antenna_mps, key=lambda v: float(np.linalg.norm(v[:2])))
         v_mps = np.asarray(at.T_world_body.rotation().matrix().T @ slower_mps)[:2]
         since_ns = detector.note(m.stamp_ns, told_m, v_mps, largest_sigma(newest.velocity_cov))
@@ -86,7 +86,7 @@ class ReceiverChecks:
         return detector.is_old(m.stamp_ns, told_m)
 
     def _is_frozen(self, stream: LiveStream, m: Measurement, told_m: Array, estimated_m: Array, sigma_m: float) -> bool:
-        """When it is first found, the fixes since the receiver froze are taken out of the window as well."""
+        """Return whether the receiver is frozen; when that is found, take its fixes since then out of the window."""
         detector, newest, at_s = stream.frozen_detector, self._states.newest, self._problem.timeline.seconds(m.stamp_ns)
         before = detector.frozen
         detector.note(at_s, told_m, estimated_m, sigma_m, newest.velocity[:2], largest_sigma(newest.velocity_cov))
@@ -98,17 +98,18 @@ class ReceiverChecks:
         return detector.frozen
 
     def _is_alone(self, stream: LiveStream) -> bool:
-        """Return whether no other sensor holds the place: one that is silent, as cameras are until the berth is in sight, does not either."""
+        """Return whether no other sensor measures position now; a silent one, as a camera far from tags, does not."""
         heard = [s for s in self._problem.others_of_place(stream.name) if len(s.measurements) > s.measurements.first]
         return only_position_sensor(stream, [stream, *heard])
 
     def _off(self, stream: LiveStream, at: Attachment, residual: Residual, off_m: Array) -> OffPrediction | None:
-        """Return how the newest fix lies to its prediction; None where the receiver's slow error is switched off, or cannot jump.
+        """Return how far the newest fix lies from its prediction.
 
-        And until the window is rebuilt with a jump that was found: it predicts fixes as of before the jump.
+        None where the receiver's slow error is switched off or cannot jump. None also from a found jump until the
+        window is rebuilt with it: until then the window predicts fixes as before the jump.
 
         Args:
-            off_m: (2,) of the fix from the estimated place, slow error aside.
+            off_m: (2,) from the estimated position to the fix, slow error not removed.
         """
         slow = stream.left_out or (stream.slow if self._problem.others_of_place(stream.name) else None)
         if slow is None or not slow.jumps or stream.receiver.jump.jumps != stream.jumps:
@@ -118,7 +119,7 @@ class ReceiverChecks:
             far = stream.slow.far_axes
             off_m = off_m - at.slow_value[far] * stream.slow.scale[far]
             without = without - residual.slow_jacobian() @ np.where(far, at.slow_value, 0.0)
-        if residual.nis() <= _FITS**2:  # the prediction takes time
+        if residual.nis() <= _FITS**2:  # saves the prediction, which takes time
             return OffPrediction(off_m, 0.0, 0.0)
         predicted = self._states.prediction(stream, at, stream.state[len(stream.measurements) - 1], residual).cov
         if not predicted.any():
@@ -135,7 +136,7 @@ class ReceiverChecks:
         self._warnings += jump_warnings(stream.name, *found, allowed=allowed, followed=not allowed)
 
     def _reject_since(self, stream: LiveStream, since_ns: int, until_ns: int) -> None:
-        """Take the fixes of an interval out of the graph: they pulled the estimate along."""
+        """Take the fixes of an interval out of the graph: they have pulled the estimate along."""
         self._agreement.forget_refused()
         stream.receiver.jump.forget_since(since_ns)
         for entry in self._entries.of(stream):
@@ -143,16 +144,16 @@ class ReceiverChecks:
                 self._entries.change(entry, replace(entry.verdict, decision=None, weight=0.0, reason=FROZEN_ONLINE))
 
     def warnings(self) -> list[str]:
-        """Return a line on each receiver whose position has jumped, or turned out to have been frozen, since this was last asked."""
+        """Return a line on each position jump, and each receiver that had been frozen, as found since the last call."""
         warnings, self._warnings = self._warnings, []
         return warnings
 
 
 def _antenna(stream: LiveStream, at: Attachment) -> tuple[Array, Array]:
-    """Return where the estimate has the antenna when a fix was measured (2,), m, and its velocity (3,), m/s, in world.
+    """Return the estimated position (2,), m, and velocity (3,), m/s, of the antenna in world, when a fix was measured.
 
-    With what is estimated of its place and of the fix's delay: else a vessel that turns about an antenna far from where it is configured
-    looks like one with a frozen receiver.
+    They include the estimated corrections of the antenna's place and of the fix's delay: else, if the antenna is far
+    from where it is configured, a vessel that turns about it looks like one with a frozen receiver.
     """
     values = (value for _, value in at.constants)
     found = corrections(zip(stream.constants, values, strict=False), gtsam.Pose3())  # in the antenna's own axes

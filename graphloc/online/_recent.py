@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the window can be rebuilt from."""
+"""Anchors and measurements that the window can be rebuilt from."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from graphloc.measurements import ImuSample, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._lag import Lag
 
-# Between two anchors: a rebuild begins up to that much before the window; as long as a page of it (`_live`).
-_EVERY_S = 1.0
+_EVERY_S = 1.0  # between two anchors: as long as a page of the window (`_live`)
 
 
 class Recent:
-    """Anchors of the window, one per second, and all that arrived since the oldest of them.
+    """Anchors of the window, one per second, and all measurements that arrived since the oldest anchor.
 
-    An anchor is the estimate from when its state was the newest: what was measured since can be used again without counting twice.
+    An anchor is the estimate of a state as it was when that state was the newest. So measurements with later stamps can
+    be used again without counting twice.
     """
 
     def __init__(self) -> None:
@@ -26,10 +26,10 @@ class Recent:
         self._before: ImuSample | None = None  # the last sample before the oldest anchor
 
     def begin(self, anchor: Anchor, came: Iterable[Measurement], before: ImuSample | None = None) -> None:
-        """A window has begun at an anchor with these measurements.
+        """Begin anew, with a window that begins at an anchor.
 
         Args:
-            before: the last IMU sample at the anchor or before it, where it is not among them.
+            came: its measurements. before: the last IMU sample at the anchor or before it, if it is not among these.
         """
         self.anchors = deque([anchor])
         self._before, self._came = before, list(came)
@@ -39,11 +39,15 @@ class Recent:
         self._came.append(m)
 
     def keep_anchor(self, lag: Lag, keep_ns: Sequence[tuple[int, int]] = (), since_ns: int | None = None) -> bool:
-        """Keep the newest state as an anchor if one is due, and forget what is older than the oldest anchor; return whether it was due.
+        """Keep the newest state as an anchor if one is due, and forget measurements older than the oldest anchor.
 
         Args:
-            keep_ns: spans (stamps) of which IMU samples are kept, however old.
-            since_ns: stamp from which all is kept, however old; None: from the oldest anchor.
+            lag: the window. keep_ns: spans (stamps) whose IMU samples are kept, however old.
+            since_ns: stamp from which everything is kept, even if the oldest anchor is newer; None: from the oldest
+                anchor on.
+
+        Returns:
+            Whether an anchor was due.
         """
         at_ns, anchors = lag.newest.stamp_ns, self.anchors
         if anchors and at_ns - anchors[-1].stamp_ns < _EVERY_S * 1e9:
@@ -61,17 +65,17 @@ class Recent:
         return True
 
     def forget_anchors(self, since_ns: int) -> None:
-        """Forget the anchors from a stamp on, but for the oldest: they have turned out to be wrong."""
+        """Forget the anchors from a stamp on, which have turned out to be wrong; the oldest anchor is always kept."""
         while len(self.anchors) > 1 and self.anchors[-1].stamp_ns >= since_ns:
             self.anchors.pop()
 
     def forget(self, measurements: Iterable[Measurement]) -> None:
-        """Forget these measurements: they are not to be used again."""
-        out = {id(m) for m in measurements}  # their numbers may be those of others that have rows already (-1)
+        """Forget measurements that are not to be used again."""
+        out = {id(m) for m in measurements}  # not by arrival number, which is -1 for several
         self._came = [m for m in self._came if id(m) not in out]
 
     def leave_out(self, after_ns: int) -> list[ImuSample]:
-        """Take out the IMU samples since a stamp and return them."""
+        """Take out the IMU samples after a stamp and return them."""
         out = [m for m in self._came if isinstance(m, ImuSample) and m.stamp_ns > after_ns]
         self._came = [m for m in self._came if not isinstance(m, ImuSample) or m.stamp_ns <= after_ns]
         return out
@@ -81,7 +85,7 @@ class Recent:
         return iter(self._came)
 
     def others(self) -> list[Measurement]:
-        """Return all but the IMU samples, in order of arrival."""
+        """Return all measurements but the IMU samples, in order of arrival."""
         return [m for m in self._came if not isinstance(m, ImuSample)]
 
     def samples(self) -> list[ImuSample]:

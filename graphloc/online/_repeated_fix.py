@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A receiver, or its driver, that repeats a fix while the vessel moves, bit for bit or but for centimetres: what it repeats is old.
+"""A receiver, or its driver, that repeats a fix while the vessel moves, bit for bit or within centimetres.
 
-At rest a receiver may rightly do so, and where it holds its position at low speed: the vessel must have been under way by the
-fixes before, and still be by the estimate; or, in hindsight, the position jumps on. Where the heading is wrong by an angle a, a
-vessel that has braked from v keeps 2 v sin(a / 2) in the estimate, but only v (1 - cos a) along v: what counts is the velocity along
-the fastest just before, and by the last of the fixes before the vessel must not have been much slower. None of this is asked of a
-receiver that has scattered at rest. One whose frozen position scatters by more: `_frozen_receiver.py`. Offline:
-`graphloc/signals/frozen_receiver.py`.
+At rest a receiver may rightly repeat a fix, and some hold their position at low speed. So the vessel must have been
+under way by the fixes before, and must still be by the estimate. Or, in hindsight, the position must jump on.
+
+The estimated speed may be wrong. If the heading is off by an angle a, a vessel that has braked from velocity v keeps a
+speed of 2 |v| sin(a / 2) in the estimate, but only |v| (1 - cos a) of it along v. So what counts is the estimated
+velocity along the fastest one just before; and by the last fixes before the repetition the vessel must not have been
+much slower than the estimate.
+
+A receiver that was seen to scatter at rest does not hold its position; where it repeats a fix bit for bit, only the
+estimated velocity along the fastest one is asked. For a frozen position that scatters by more than centimetres see
+`_frozen_receiver.py`; offline: `graphloc/signals/frozen_receiver.py`.
 """
 
 from __future__ import annotations
@@ -30,39 +35,44 @@ from graphloc.signals.frozen_receiver import (
 )
 from graphloc.time import NS_PER_S
 
-_SAME_M, _AWAY_M = 0.2, 1.0  # of one place; how far the vessel has gone by then, unless a fix equals the one before
-_SIGMAS = 3.0  # of the estimated speed
-_SHARE = 0.5  # of the speed before, by the fixes and as estimated: below that the vessel brakes
-_KEPT = 200  # so that memory stays bounded: ten seconds of a receiver at 20 Hz; a choice
+# Fixes nearer than the first are of one place; so far (m) must the vessel have gone by then, unless a fix equals the
+# one before.
+_SAME_M, _AWAY_M = 0.2, 1.0
+_SIGMAS = 3.0  # sigmas that the estimated speed must exceed
+_SHARE = 0.5  # share of the speed before, by the fixes or as estimated, below which the vessel brakes
+_KEPT = 200  # items, so that memory stays bounded: ten seconds of a receiver at 20 Hz; a choice
 
 
 class RepeatedFixDetector:
-    """The detector of one receiver. It outlives the window: a rebuild takes in the same fixes once more.
+    """The detector of one receiver. It outlives the window; fixes that a rebuild feeds it again are ignored as late.
 
     Attributes:
-        frozen: it has repeated one place for seconds, and does so until another comes.
+        frozen: whether it has repeated one place for seconds (`HELD_S`); so until another place comes.
     """
 
     def __init__(self) -> None:
         self.frozen = False
-        # The last different ones: stamp (ns) that each begins at, place, and the estimated velocity there.
+        # The last different places: stamp (ns) of the first fix there, place, and the estimated velocity at that stamp.
         self._places: deque[tuple[int, Array, Array]] = deque(maxlen=_KEPT)
         self._rest: deque[tuple[int, Array]] = deque(maxlen=_KEPT)  # fixes of some seconds, none repeated
-        # How often such fixes were at rest: then the receiver scatters there, and does not repeat a position.
+        # How often such fixes were at rest: the receiver then scatters there, and does not repeat a position
         self._seen = 0
-        self._last: tuple[int, Array] | None = None
-        self._equal_ns, self._equal = 0, 0  # stamp of the first of the fixes that equal the last one, and their number
-        self._since_ns: int | None = None  # stamp of the first of the repetitions that are old
-        self._old: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)  # first and last stamp, place
+        self._last: tuple[int, Array] | None = None  # newest fix
+        self._equal_ns, self._equal = 0, 0  # stamp of the first of the fixes that equal the newest, and their number
+        self._since_ns: int | None = None  # stamp of the first old repetition of the present place; None: there is none
+        self._old: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)  # old repetitions: first and last stamp, place
 
     def note(self, stamp_ns: int, told_m: Array, v_mps: Array, sigma_mps: float) -> int | None:
-        """Take in a fix; one that is late is ignored.
+        """Take in a fix; a late one is ignored.
 
         Args:
-            told_m: (2,) in world. v_mps: (2,) in body, of the vessel or its antenna, as estimated; with its sigma.
+            stamp_ns: of the fix. told_m: (2,) position in world. v_mps: (2,) estimated velocity of the vessel or its
+                antenna, in body.
+            sigma_mps: of that velocity.
 
         Returns:
-            The stamp (ns) of the first of the fixes that turn out to have been old, where this one goes on from them.
+            The stamp (ns) from which the fixes before this one turn out to have been old, because this one jumps on;
+            else None.
         """
         last, turned_out = self._last, None
         if last is not None and stamp_ns <= last[0]:
@@ -115,18 +125,18 @@ class RepeatedFixDetector:
         if not equals and speed_mps * (stamp_ns - self._places[-1][0]) < _AWAY_M * NS_PER_S:
             return False
         least_mps = UNDER_WAY_MPS
-        if not (equals and self._seen >= SEEN):  # it may hold its position at rest
+        if not (equals and self._seen >= SEEN):  # else the receiver does not hold its position at rest
             before_mps = self._speed_before_mps()
             if before_mps is None or self._slowed_down(float(np.linalg.norm(v_mps))):
                 return False
             least_mps = max(least_mps, _SHARE * max(before_mps, fastest_mps))
         if speed_mps < least_mps:
             return False
-        # While its fixes are left out the speed becomes uncertain: that is no evidence of rest.
+        # While its fixes are left out the speed grows uncertain: that is no evidence of rest.
         return self._since_ns is not None or speed_mps > _SIGMAS * sigma_mps
 
     def _went_on(self, stamp_ns: int, told_m: Array, last: tuple[int, Array]) -> bool:
-        """Whether a position jumps on that was repeated bit for bit, as `frozen_fixes` would tell of the whole run."""
+        """Return whether the position jumps on after bit-for-bit repetitions, by the rule of `frozen_fixes`."""
         if self._equal < FEWEST or last[0] - self._equal_ns < HELD_S * NS_PER_S:
             return False
         before_mps = 0.0 if self._seen >= SEEN else self._speed_before_mps()
@@ -135,18 +145,18 @@ class RepeatedFixDetector:
         return before_mps is not None and goes_on(jump_m, before_mps, held_s, silent_s)
 
     def _speed_before_mps(self) -> float | None:
-        """The speed by the different places up to the one that is repeated; None: it may have been at rest."""
+        """Return the speed by the different places up to the repeated one; None: the vessel may have been at rest."""
         t_s = np.array([(at_ns - self._places[0][0]) / NS_PER_S for at_ns, _, _ in self._places])
         return under_way(t_s, np.array([place for _, place, _ in self._places]))
 
     def _slowed_down(self, estimated_mps: float) -> bool:
-        """Whether by the later half of the different places the vessel was slower than the estimate has it now: the latter missed that."""
+        """Return whether the later half of the places is much slower than the estimate, which missed the braking."""
         later = list(self._places)[len(self._places) // 2 :]
         t_s = np.array([(at_ns - later[0][0]) / NS_PER_S for at_ns, _, _ in later])
         return speed_of(t_s, np.array([place for _, place, _ in later]))[0] < _SHARE * estimated_mps
 
     def is_old(self, stamp_ns: int, told_m: Array) -> bool:
-        """Return whether a fix that has been taken in, or comes late, is such a repetition."""
+        """Return whether a fix, taken in or late, is an old repetition."""
         return any(a <= stamp_ns <= b and _same(told_m, place) for a, b, place in self._old)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A receiver, or its driver, that repeats a velocity bit for bit: it hangs. Offline: `graphloc/signals/frozen_receiver.py`."""
+"""A receiver or driver that hangs, repeating a velocity bit for bit (offline: `signals/frozen_receiver.py`)."""
 
 from __future__ import annotations
 
@@ -10,21 +10,23 @@ import numpy as np
 from graphloc.frames import Array
 from graphloc.signals.frozen_receiver import MANY, MOSTLY, REST_MPS
 
-_RUNS = 20  # velocities after which it is known whether they are rounded
+_RUNS = 20  # different velocities after which it is known whether they are rounded
 _KEPT = 200  # as in `_repeated_fix`
 
 
 class RepeatedVelocityDetector:
-    """The detector of one receiver. It outlives the window: a rebuild takes in the same velocities once more."""
+    """The detector of one receiver. It outlives the window; what a rebuild feeds it again is ignored as late."""
 
     def __init__(self) -> None:
         self._last: tuple[int, Array] | None = None
-        self._begin_ns, self._equal = 0, 0  # stamp of the first of those that equal the last one, and their number
-        self._runs = self._singles = 0  # of equal ones; those of a single one
-        self._old: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)  # stamps (ns) between which this one is old
+        # Stamp of the first of the velocities that equal the newest, and their number
+        self._begin_ns, self._equal = 0, 0
+        self._runs = self._singles = 0  # number of runs of equal velocities; number of runs of length 1
+        # Old repetitions: first and last stamp (ns), velocity
+        self._old: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)
 
     def note(self, stamp_ns: int, v_mps: Array) -> None:
-        """Take in a velocity (3,), m/s in world; one that is late is ignored."""
+        """Take in a velocity (3,), m/s in world; a late one is ignored."""
         if self._last is not None and stamp_ns <= self._last[0]:
             return
         if self._last is None or not np.array_equal(v_mps, self._last[1]):
@@ -39,5 +41,5 @@ class RepeatedVelocityDetector:
             self._old.append((self._begin_ns + 1, *self._last))
 
     def is_old(self, stamp_ns: int, v_mps: Array) -> bool:
-        """Return whether a velocity that has been taken in, or comes late, is such a repetition."""
+        """Return whether a velocity, taken in or late, is an old repetition."""
         return any(a <= stamp_ns <= b and np.array_equal(v_mps, v) for a, b, v in self._old)

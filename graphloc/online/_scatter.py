@@ -13,12 +13,12 @@ from graphloc.frames import Array
 from graphloc.solve.scatter import GOLDEN, LAGS_S, SPARE, WHITE_S, noisier_than_stated
 from graphloc.time import NS_PER_S
 
-_REMEMBERED = 300  # residuals, and pairs of them
-_FEWEST_BENT = 20  # second differences of residuals, from which white noise is judged
+_REMEMBERED = 300  # residuals that are remembered; as many pairs and second differences of them
+_FEWEST_BENT = 20  # second differences of residuals from which white noise is judged
 
 
 class _Median:
-    """The median of the last values: it is asked for with each new one, and sorting them anew took a twentieth of an update."""
+    """The median of the last values, kept sorted: to sort them anew for each value took a twentieth of an update."""
 
     def __init__(self) -> None:
         self._came: deque[float] = deque()
@@ -42,17 +42,18 @@ class _Median:
 class Scatter:
     """By what factor a sensor's residuals scatter more than configured: about 0, or about each other if that is less.
 
-    An error that residuals share is no noise. With the scatter about 0 alone, a compass that was 15 deg off beside a crane was
-    believed after 15 s, because half of the remembered residuals were that large. With the scatter about each other alone, one
-    third of outliers would make half of all pairs wide. The two residuals of a pair are 2 to 4 s apart, evenly distributed:
-    with one fixed distance, swell of that period would not show.
+    An error that residuals share is no noise. With the scatter about 0 alone, a compass that was 15 deg off beside a
+    crane was believed after 15 s, because half of the remembered residuals were that large. With the scatter about each
+    other alone, one third of outliers would make half of all pairs wide. The two residuals of a pair are 2 to 4 s
+    apart, evenly distributed: with one fixed distance, swell of that period would not show.
 
     Args:
-        jumps: the shared error is modelled as a state that may jump, and has not yet: then only about 0.
+        jumps: whether the shared error is estimated as a slow error that may jump. Then only the scatter about 0
+            counts, because residuals share a jump until the slow error follows it.
 
     Attributes:
-        times: the factor, at least 1. noisier: factor on the stated sigma (see `noisier_than_stated`), at most as large.
-        said: whether that has been reported.
+        times: the factor, at least 1. noisier: factor on the stated sigma (see `noisier_than_stated`), at most `times`.
+        said: whether `noisier` has been reported.
     """
 
     def __init__(self, *, jumps: bool = False) -> None:

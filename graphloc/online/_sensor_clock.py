@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sensor's clock that is set by whole seconds in mid-run: a receiver learns of leap seconds, or goes from UTC to GPS time.
+"""A sensor's clock that is set by whole seconds in mid-run: by leap seconds, or from UTC to GPS time.
 
-Its next fixes seem to come from the future, or long after; used at their stamps they are seconds of motion off.
+By their stamps, its next fixes seem to come from the future, or very late; used at these stamps, they are off by
+seconds of motion.
 """
 
 from __future__ import annotations
@@ -13,23 +14,28 @@ from statistics import median
 from graphloc.measurements import Measurement
 from graphloc.time import GPS_AHEAD_S, NS_PER_S, utc_text
 
-_REMEMBERED, _FEWEST = 20, 10  # measurements that tell how their stamps and arrival usually are
-_IN_A_ROW = 5  # measurements after a leap that tell it: an outlying stamp is one
-_SEEMS_S, _WHOLE_S = 0.5, 0.1  # by which it seems to be one, and may be off whole seconds, as some messages take longer
-_SLOWEST_S = 1.2  # between arrivals: of slower sensors the first ones held back would leave the window meanwhile
-_UNEVEN = 0.5  # of the usual time between arrivals: a message that waited, or an IMU that stalled, is no leap
-_STEADY = 0.75  # of those before, that came alike
-_AT_ONCE_S = 0.75  # between two messages, at the least: where they wait longer and longer each does by `_UNEVEN` of `_SLOWEST_S` at most
-_FUTURE_S = 3.0  # ahead of the IMU, all the time: no message is that much faster
+_REMEMBERED, _FEWEST = 20, 10  # most and fewest measurements that tell how their stamps and arrivals usually are
+_IN_A_ROW = 5  # measurements that must show a leap; an outlying stamp is a single one
+# Size from which it may be a leap; how far off whole seconds, as some messages take longer
+_SEEMS_S, _WHOLE_S = 0.5, 0.1
+# Longest usual time between arrivals: of a slower sensor, the first that are held back would leave the window
+_SLOWEST_S = 1.2
+# Share of the usual time between arrivals by which one may differ: a late message or a stalled IMU is no leap
+_UNEVEN = 0.5
+_STEADY = 0.75  # share of the measurements before that must have come with the usual delay
+# Least change of the delay from one message to the next: where messages wait longer and longer, each waits at most
+# `_UNEVEN` of `_SLOWEST_S` longer than the one before.
+_AT_ONCE_S = 0.75
+_FUTURE_S = 3.0  # ahead of the IMU all the time: no message is so much faster
 
 
 @dataclass(frozen=True, slots=True)
 class PutRight:
-    """What can be used now that a measurement has come.
+    """The measurements that can be used once a measurement has arrived.
 
     Attributes:
-        found: measurements, put right. said: what is to be said, or nothing.
-        earlier_off_ns: by how much all stamps before these were ahead, as has turned out by now.
+        found: the measurements, stamps corrected. said: a line for users, or empty.
+        earlier_off_ns: by how much the stamps of all measurements before these turn out to have been ahead.
     """
 
     found: list[Measurement]
@@ -38,27 +44,28 @@ class PutRight:
 
 
 class SensorClock:
-    """Puts right the stamps of one sensor as they arrive, by those of the IMU.
+    """Corrects the stamps of one sensor as they arrive, by the stamps of the IMU.
 
-    A leap is one that comes while both arrive as evenly as before, and that is the same for some measurements in a row, which are held
-    back so long. An IMU whose clock is set does not go on evenly. (Offline the times of recording tell it: `frontends/_clock.py`.)
-    Of the stamps before and after, those nearer to the IMU's are right, as offline: a receiver that learns of leap seconds begins with wrong
-    ones.
+    The clock was set if the stamps leap while sensor and IMU arrive as evenly as before, by the same amount for some
+    measurements in a row; these are held back until then. If the IMU's clock is set, the IMU does not go on evenly.
+    (Offline, the times of recording tell a leap: `frontends/_clock.py`.) The stamps before or after the leap are right,
+    whichever are nearer to the IMU's, as offline: the stamps of a receiver that has yet to learn of leap seconds are
+    wrong before it.
 
     Attributes:
-        set_ns: by how much the clock has been set so far; it is taken off each stamp.
+        set_ns: by how much the clock has been set so far; it is subtracted from each stamp.
     """
 
     def __init__(self) -> None:
         self.set_ns = 0
-        self._ahead_ns: deque[int] = deque(maxlen=_REMEMBERED)  # of the IMU's newest sample, when they came
-        self._apart_ns: deque[int] = deque(maxlen=_REMEMBERED)  # time of the IMU between arrivals
-        self._imu_ns = 0  # newest sample at the last arrival
-        self._held: list[tuple[Measurement, int]] = []  # each with its leap, ns
+        self._ahead_ns: deque[int] = deque(maxlen=_REMEMBERED)  # stamps less that of the newest IMU sample at arrival
+        self._apart_ns: deque[int] = deque(maxlen=_REMEMBERED)  # time between arrivals, by the IMU's stamps
+        self._imu_ns = 0  # stamp of the newest IMU sample at the last arrival
+        self._held: list[tuple[Measurement, int]] = []  # held back, each with the size of its leap, ns
         self._said = False
 
     def right(self, m: Measurement) -> Measurement:
-        """Return a measurement with its stamp put right by what is known so far."""
+        """Return a measurement with its stamp corrected by `set_ns`."""
         return replace(m, stamp_ns=m.stamp_ns - self.set_ns) if self.set_ns else m
 
     def take(self, m: Measurement, imu_ns: int) -> PutRight:
@@ -84,7 +91,7 @@ class SensorClock:
         return self._decide() if len(self._held) == _IN_A_ROW else PutRight([])
 
     def left(self) -> list[Measurement]:
-        """Return what is held back, as it came."""
+        """Return the measurements that are held back, their leap not corrected, and hold none any more."""
         held, self._held = self._held, []
         return [m for m, _ in held]
 
@@ -94,7 +101,11 @@ class SensorClock:
         return [m]
 
     def _as_they_come(self, m: Measurement) -> PutRight | None:
-        """Put stamps right no more where they are nearer to the IMU's as they come: the clock was set again while the sensor was silent."""
+        """Correct stamps no more if they are nearer to the IMU's as they come: the clock was set again in a silence.
+
+        Returns:
+            What can be used then; None: the stamps are still to be corrected.
+        """
         usual_ns = median(self._ahead_ns)
         if len(self._ahead_ns) < _FEWEST or _wrong(usual_ns + self.set_ns) >= _wrong(usual_ns):
             return None
@@ -103,7 +114,7 @@ class SensorClock:
         return PutRight([*self._begin_anew(), m], said)
 
     def _from_the_future(self, sensor: str) -> str:
-        """Return what is to be said, once, where all stamps are ahead of the IMU's while it goes on."""
+        """Return a line for users, once, if all stamps are ahead of the IMU's while the IMU goes on; else empty."""
         least_s, goes_on = min(self._ahead_ns) / NS_PER_S, median(self._apart_ns) > 0
         if self._said or len(self._ahead_ns) < _FEWEST or least_s < _FUTURE_S or not goes_on:
             return ""
@@ -116,7 +127,7 @@ class SensorClock:
         return self.left()
 
     def _decide(self) -> PutRight:
-        """Return what is held back, put right where it is by whole seconds."""
+        """Return the measurements that were held back; their stamps are corrected if they leapt by whole seconds."""
         by_s, usual_s = median(by_ns for _, by_ns in self._held) / NS_PER_S, median(self._ahead_ns) / NS_PER_S
         whole_s = round(by_s)
         if not whole_s or abs(by_s - whole_s) > _WHOLE_S:
@@ -137,5 +148,5 @@ class SensorClock:
 
 
 def _wrong(ahead: float) -> float:
-    """Return how far stamps are off the IMU's; twice as far where they are ahead of it: a message may come late, but hardly early."""
+    """Return how wrong stamps are: distance from the IMU's, doubled if ahead: messages come late, but hardly early."""
     return max(-ahead, 2.0 * ahead)

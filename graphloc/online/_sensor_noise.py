@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of fixes, poses and matches that scatter more from one to the next than they state (offline: `solve/sensor_noise.py`)."""
+"""Noise of fixes, poses and matches that scatter more than they state (offline: `solve/sensor_noise.py`)."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from graphloc.solve.sensor_noise import Pair, pairs_of, times_stated
 from graphloc.solve.warnings import scale_warning
 from graphloc.time import duration_ns
 
-_EVERY_S = 5.0  # between two looks, to save time: a factor is that of a minute or more of pairs; a choice
-_SETTLED_S = 1.5  # after so long a measurement has been judged again
-_REMEMBERED = 100  # pairs
-# Of the pairs since the last look, so that the remembered ones are of a minute or more: ten seconds of multipath are as many pairs of a
-# fast receiver.
+_EVERY_S = 5.0  # between two looks, to save time: a factor is told by a minute or more of pairs; a choice
+_SETTLED_S = 1.5  # age at which a measurement has been judged again
+_REMEMBERED = 100  # pairs that are remembered
+# Most pairs that are taken of those since the last look, so that the remembered ones cover a minute or more: of a fast
+# receiver, ten seconds of multipath have as many pairs.
 _AT_ONCE = 6
 
 
 class SensorNoise:
-    """Factors on the sigmas that measurements come with, by the last minute or more.
+    """Factors on the sigmas that measurements state, as told by the last minute or more.
 
     Attributes:
-        times: by sensor and key of its configuration; where there is none, sigmas are as stated.
+        times: factors, by sensor and key of its configuration; where there is none, sigmas are taken as stated.
     """
 
     def __init__(self, times: Mapping[str, Mapping[str, float]] | None = None) -> None:
@@ -36,17 +36,17 @@ class SensorNoise:
         self._pairs: dict[str, deque[Pair]] = {}
 
     def forget_clock(self) -> None:
-        """Forget stamps of a clock that was set back: by these, nothing would be newer until it has caught up."""
+        """Forget stamps of a clock that was set back: else nothing is newer until it has caught up with them."""
         self._looked_ns, self._last = 0, {}
 
     def enlarge(self, by: Mapping[str, Mapping[str, float]]) -> None:
-        """Enlarge the factors; `by`: as `times`."""
+        """Multiply the factors by others; `by`: in the form of `times`."""
         for name, own in by.items():
             times = self.times.setdefault(name, {})
             times |= {key: times.get(key, 1.0) * each for key, each in own.items()}
 
     def changed(self, lag: Lag) -> str:
-        """Change the factors of a sensor where others clearly explain better how it scatters; return a line on that, or empty."""
+        """Change a sensor's factors where others clearly explain its scatter better; return a line on it, or empty."""
         at_ns = lag.newest.stamp_ns
         if 0 <= at_ns - self._looked_ns < _EVERY_S * 1e9:
             return ""
@@ -62,7 +62,7 @@ class SensorNoise:
             self._last[name] = judged[-1]
             if (found := times_stated(pairs, times)) != times:
                 self.times[name] = found
-                del self._last[name]  # of another sigma
+                del self._last[name]  # its residual is by the sigma before
                 return _line(name, stream.config, times, found)
         return ""
 
@@ -73,7 +73,7 @@ def _as_configured(pair: Pair, times: Mapping[str, float]) -> Pair:
 
 
 def _line(name: str, taken: SensorConfig, before: Mapping[str, float], now: Mapping[str, float]) -> str:
-    """Return what is said of factors that have changed; `taken`: the configuration with those before."""
+    """Return a line on factors that have changed; `taken`: the sensor's configuration with the factors `before`."""
     stated = taken.scaled({key: 1.0 / by for key, by in before.items()})
     said = scale_warning(name, stated, stated.scaled(now))
     if said and any(by > before.get(key, 1.0) for key, by in now.items()):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the online mode is set up with, and what follows from it: none of it changes with what is measured."""
+"""The setup of the online mode, and what follows from it: none of this changes with the measurements."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from graphloc.inertial import InertialRow
 from graphloc.measurements import Measurement
 from graphloc.recording import Mounts
 
-# Keys of what a sensor's slow state and constants are added to.
+# Keys of the settings that a sensor's slow state and constants are added to.
 _ADDED_TO = {"mount", "cameras", "lidars", "time_offset_s", "survey", "height_m"}
 
 
@@ -49,12 +49,12 @@ class Setup:
 
     @cached_property
     def bridge_s(self) -> float:
-        """The longest IMU gap that is bridged; after a longer one the estimate restarts."""
+        """Longest IMU gap (s) that is bridged; after a longer one the estimate restarts."""
         return 0.0 if self.imu is None else self.imu.max_bridge_s
 
     @cached_property
     def gap_s(self) -> float:
-        """The longest step between IMU samples that is no gap."""
+        """Longest step (s) between IMU samples that is no gap."""
         return 0.0 if self.imu is None else self.imu.max_gap_s
 
     @cached_property
@@ -65,7 +65,7 @@ class Setup:
 
     @cached_property
     def apart_ns(self) -> dict[str, int]:
-        """Of each of these, how close to the one before a measurement tells nothing new."""
+        """By sensor in `measuring`, the time (ns) since the last measurement within which another tells nothing new."""
         return {name: self.config.sensors[name].apart_ns for name in self.measuring}
 
     @cached_property
@@ -75,7 +75,7 @@ class Setup:
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """By enabled sensor, as plain data, the axes of its slow state, and what this and its constants are added to."""
+        """By enabled sensor, as plain data: axes of its slow state, and the settings that this and constants add to."""
         found = {}
         for name, row in rows_of(self.config, self.rows).items():
             sensor = self.config.sensors[name]
@@ -87,16 +87,16 @@ class Setup:
         return found
 
     def hint(self, m: Measurement, datum: Datum) -> Hint:
-        """Return what a measurement says by itself."""
+        """Return what a single measurement says of the body, without an estimate."""
         sensor = self.config.sensors[m.sensor]
         R = mount_of(m.sensor, sensor, self.mounts)[1]
         row = next(row for row in self.rows if row.kind == sensor.kind)
         return row.hint(m, float(yaw_from_rotation(R)), datum)
 
     def scaled(self, times: Mapping[str, Mapping[str, float]]) -> Setup:
-        """Return the same with numbers of sensors so many times as large; `times`: by sensor and key of its configuration."""
+        """Return the setup with settings multiplied by factors; `times`: by sensor and key of its configuration."""
         return replace(self, config=self.config.scaled(times))
 
     def without_start_heading(self) -> Setup:
-        """Return the same for a later start: the configured heading is that of the first start alone."""
+        """Return the setup for a later start: the configured heading is that of the first start alone."""
         return replace(self, config=self.config.with_start_heading(None))

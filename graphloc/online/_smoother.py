@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feed measurements as they arrive, get estimates.
 
-Either there is an estimate (`_tracking`), or all that arrives is held until one can be started (`_waiting`, `_start`). A window
-that fails is rebuilt from an earlier state. The estimate restarts where that fails too, where the IMU was silent for too long, where
-its clock was set back, and where no absolute sensor agrees any more.
+Either there is an estimate (`_tracking`), or all that arrives is held until one can be started (`_waiting`, `_start`).
+A window that fails is rebuilt from an earlier state. The estimate restarts where that fails too, where the IMU was
+silent for too long, where its clock was set back, and where no absolute sensor agrees any more.
 """
 
 from __future__ import annotations
@@ -56,12 +56,14 @@ class OnlineSmoother:
     Args:
         config: the vessel, its surveys read. rows, inertial: the table of sensors (`graphloc.factors`).
         datum: origin of world; None: from the configuration, or else from the first fixes.
-        mounts: body -> sensor (t (3,), R (3, 3)) of sensors whose mount is not the configuration's (`tf_frame`, of /tf_static).
+        mounts: body -> sensor (t (3,), R (3, 3)) of sensors whose mount is not the configuration's (`tf_frame`, of
+            /tf_static).
         lag_s: how long a measurement can still be judged otherwise, and how late it may come.
         snapshot: file to write the state to every few seconds, and to resume from if it is there; None: no such file.
 
     Raises:
-        InputError: a sensor measures in world, whose origin is not known; or a mount is given by a frame that is not in `mounts`.
+        InputError: a sensor measures in world, whose origin is not known; or a mount is given by a frame that is not in
+            `mounts`.
     """
 
     def __init__(
@@ -95,10 +97,11 @@ class OnlineSmoother:
         self._say(trouble)
         self._waiting = Waiting(self._ledger)
         self._tracking: Tracking | None = None
-        # To start over where the heading was a guess: stamp of the last try, and how often the data denied a heading that the motion told.
+        # To start over where the heading was a guess: stamp of the last try, and how often the data denied a heading
+        # that the motion told.
         self._tried_ns, self._denied = 0, 0
         self.antennas_off_m: Mapping[str, Array] = {}
-        """By receiver, place of the antenna less that of its mount (3,), m, body axes, where it is estimated; set by `finish`."""
+        """By receiver, the antenna's place less that of its mount (3,), m, body axes, if estimated; set by `finish`."""
         self._wait(
             "the first IMU sample" if imu else f"an IMU: no enabled sensor of kind {inertial.kind} is configured"
         )
@@ -126,7 +129,8 @@ class OnlineSmoother:
     def predict(self, stamp_ns: int | None = None) -> Estimate | None:
         """Return the newest state propagated by the IMU to a stamp; by default that of the newest IMU sample.
 
-        None before the start, and for a stamp that lies farther ahead of the IMU than its silences are bridged (`max_bridge_s`).
+        None before the start, and for a stamp that lies farther ahead of the IMU than its silences are bridged
+        (`max_bridge_s`).
         """
         newest = self._intake.newest
         if self._tracking is None or newest is None:
@@ -141,7 +145,7 @@ class OnlineSmoother:
         return self._estimate(at_ns)
 
     def window(self) -> Trajectory | None:
-        """Return the states of the lag as estimated now, and the newest one propagated to the newest IMU sample: a prior for front-ends.
+        """Return the states of the lag, and the newest propagated to the newest IMU sample: a prior for front-ends.
 
         All have the covariance of the newest, because scans are searched around that (see `Tracking.trajectory`).
         """
@@ -149,13 +153,13 @@ class OnlineSmoother:
         return None if now is None or self._tracking is None else self._tracking.trajectory(now)
 
     def rows(self) -> list[LedgerRow]:
-        """Return the ledger rows that became final since the last call; that of a measurement does when it leaves the lag."""
+        """Return the ledger rows that became final since the last call; a measurement's does when it leaves the lag."""
         if self._tracking is not None:
             self._ledger.enter(self._tracking.lag.gone())
         return self._ledger.taken()
 
     def events(self) -> list[Event]:
-        """Return what happened since the last call: start, restart, rebuild, resume, and what is wrong with a sensor."""
+        """Return what happened since the last call: start, restart, rebuild, resume, what is wrong with a sensor."""
         events, self._events = self._events, []
         return events
 
@@ -196,7 +200,7 @@ class OnlineSmoother:
         return None
 
     def _put_right(self, sensor: str, off_ns: int) -> None:
-        """Correct the stamps of what is held of a sensor, which were ahead by `off_ns`; an estimate that used them starts anew."""
+        """Take `off_ns` off the stamps of what is held of a sensor; an estimate that used these stamps starts anew."""
 
         def right(m: Measurement) -> Measurement:
             return replace(m, stamp_ns=m.stamp_ns - off_ns) if m.sensor == sensor else m
@@ -283,7 +287,7 @@ class OnlineSmoother:
     # An estimate underway
 
     def _advance(self, tracking: Tracking, until_ns: int) -> Estimate | None:
-        """Make the states that are due up to a stamp, judge what attaches to them, and rebuild or restart where that asks for it."""
+        """Make the states due up to a stamp, judge what attaches to them, and rebuild or restart if that is needed."""
         if not tracking.due(until_ns):
             return None
         try:
@@ -433,10 +437,13 @@ class OnlineSmoother:
     def _start_with_heading(
         self, tracking: Tracking, now_ns: int, known: UnmeasuredHeading | None
     ) -> tuple[str, Started, list[Measurement]] | None:
-        """Return a new start where the heading was a guess, and sensors or the motion tell it by now: why, the start, and its data.
+        """Return a new start where the heading was a guess, but sensors or the motion tell it by now.
 
-        None where the heading was no guess, or nothing tells it yet. If the window corrected a wrong guess instead, wrong biases,
-        velocities and places of antennas would stay, and with them a wrong heading.
+        Returns:
+            Why, the start, and its data.
+
+        None where the heading was no guess, or nothing tells it yet. If the window corrected a wrong guess instead,
+        wrong biases, velocities and places of antennas would stay, and with them a wrong heading.
 
         Args:
             known: by how much the heading could be off before the newest state; None: it was no guess.

@@ -20,9 +20,8 @@ from graphloc.online._unmodelled import ErrorSizes
 from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE
 
 _VERSION = 11
-# So much is lost where the process is killed: short beside the 20 s that an IMU gap is bridged; a choice.
-_EVERY_S = 2.0
-_MOST_TIMES = 1e4  # of a data sheet's noise, that an IMU on any engine has
+_EVERY_S = 2.0  # lost where the process is killed: short beside the 20 s for which an IMU gap is bridged; a choice
+_MOST_TIMES = 1e4  # factor on a data sheet's noise that no sensor exceeds, not even an IMU on an engine
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -30,15 +29,19 @@ class Snapshot:
     """What the online mode resumes from.
 
     Attributes:
-        vessel: its name. anchor: the newest state. imu: the sample at it or before.
+        vessel: its name. anchor: the state to resume at. imu: the last IMU sample at or before it.
         datum: origin of world. heights_m: configured heights (m, up in world), by sensor.
-        agreed_ns: stamp at which each absolute sensor last agreed. noise: factors on the IMU noise, on that of the gyroscope,
-            that of the accelerometer, and the walk of the biases of accelerometers and gyroscopes. sensor_noise: those of other sensors' sigmas (`SensorNoise.times`).
-        heading: where no sensor measures it, how far it may be off.
+        agreed_ns: stamp at which each absolute sensor last agreed.
+        noise: factors on the noise of the IMU, on that of its gyroscope, on that of its accelerometer, and on the walk
+            of the biases of accelerometers and of gyroscopes. sensor_noise: factors on other sensors' sigmas
+            (`SensorNoise.times`).
+        heading: how far the heading may be off where no sensor measures it; None: one does, or the motion has confirmed
+            it.
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
         clocks_set_ns: by how much the clocks of sensors have been set (`SensorClock`), by sensor.
-        settings: by sensor, what slow states and constants in the anchor are, and what they are added to (`Setup.settings`).
-        unmodelled: sizes of `UnmodelledError`; None where no slow error is left out, and the IMU's mount is right.
+        settings: by sensor, the settings that slow states and constants in the anchor are added to (`Setup.settings`).
+        unmodelled: sizes of `UnmodelledError`; None where no slow error is left out, and the IMU's mount is known
+            exactly.
     """
 
     vessel: str
@@ -57,10 +60,12 @@ class Snapshot:
     unmodelled: ErrorSizes | None
 
     def for_settings(self, now: Mapping[str, Any]) -> Snapshot:
-        """Return it without what is known of sensors that are set otherwise now: corrected as told, they would be corrected twice.
+        """Return the snapshot without the slow states, constants and clocks of sensors that are set otherwise now.
+
+        A setting that users have corrected, as they were told, would else be corrected twice.
 
         Args:
-            now: `Setup.settings`.
+            now: the present `Setup.settings`.
         """
         same = {name for name, were in self.settings.items() if were == now.get(name)}
         anchor = replace(
@@ -73,10 +78,10 @@ class Snapshot:
         )
 
     def write(self, path: Path) -> None:
-        """Replace the file atomically: a kill leaves the old one or the new one.
+        """Replace the file atomically: if the process is killed, the old file or the new one is left.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
         raw = {
             "version": _VERSION,
@@ -102,10 +107,10 @@ class Snapshot:
 
     @classmethod
     def read(cls, path: Path, sensor: str) -> Snapshot:
-        """Return what a file holds; `sensor`: name of the IMU.
+        """Return the snapshot in a file; `sensor`: name of the IMU.
 
         Raises:
-            OSError, KeyError, TypeError, ValueError: it cannot be read, or is damaged.
+            OSError, KeyError, TypeError, ValueError: the file cannot be read, or is damaged.
         """
         raw = json.loads(path.read_text(encoding="utf-8"))
         if raw["version"] != _VERSION:
@@ -137,7 +142,7 @@ class Snapshot:
         return found
 
     def _is_sound(self) -> bool:
-        """Whether its numbers, those of the anchor and of the sample aside, are ones that a run can have had."""
+        """Return whether a run can have had these numbers; those of the anchor and the sample are not checked."""
         scale, heading, R = self.noise[0], self.heading, self.R_odom_body
         raised = [*self.noise, *(by for times in self.sensor_noise.values() for by in times.values())]
         numbers = np.concatenate(
@@ -165,15 +170,15 @@ class SnapshotFile:
         self._unwritable = False
 
     def due(self, at_ns: int) -> bool:
-        """Whether it is time to write one."""
+        """Return whether it is time to write a snapshot."""
         return self._path is not None and at_ns - self._written_ns >= _EVERY_S * 1e9
 
     def restart(self) -> None:
-        """The next is due at once, whatever the clock says."""
+        """Make the next snapshot due at once, even if the clock was set back."""
         self._written_ns = 0
 
     def write(self, snapshot: Snapshot) -> str:
-        """Replace what is there; where that fails, return why, the first time in a row only."""
+        """Replace the file; if that fails, return why, the first time in a row only; else empty."""
         assert self._path is not None
         self._written_ns = snapshot.anchor.stamp_ns
         try:
@@ -185,7 +190,7 @@ class SnapshotFile:
         return ""
 
     def read(self, vessel: str, imu: str, datum: Datum | None) -> tuple[Snapshot | None, str]:
-        """Return the snapshot that is there, or None and why it cannot be used (another vessel or origin, damaged)."""
+        """Return the snapshot in the file, or None and why it cannot be used; why is empty where there is no file."""
         path = self._path
         if path is None or not path.exists():
             return None, ""

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The start: wait until position and heading are observable, then solve the data so far with the batch solver.
 
-The window then begins at the first data, with the prior of the start, linearised at the solution: the choice of modes
-among matches stays open for as long as these are in the window. Where the start had to wait for much longer than the window (for
-a heading from travel alone), the window begins its own length ago, with the prior that all earlier data give for that state.
+The window then begins at the first data, with the prior of the start, linearised at the solution. So the choice of
+modes of matches stays open as long as these are in the window. If the start had to wait for much longer than the window
+is (for a heading from travel alone), the window begins its own length before the newest data, with the prior that all
+earlier data give for the state there.
 """
 
 from __future__ import annotations
@@ -38,13 +39,18 @@ from graphloc.solve.unmodelled import Unmodelled, unmodelled
 from graphloc.solve.warnings import noise_warnings
 from graphloc.time import duration_ns
 
-LEAST_S = 5.0  # of IMU data: gives gyro bias, roll and pitch of a vessel in waves
-_LONGEST_WAIT_S = 30.0  # for a heading from travel alone, or an IMU that fits; then a position with a doubtful heading is better than none
-_DOUBTFUL = 0.1  # probability of being false, above which several must agree; tags and poses lie below
-# Number and share that must agree, and for how long that is waited for: two false matches of five may agree with each other.
+LEAST_S = 5.0  # of IMU data: enough for the gyroscope's bias, roll and pitch of a vessel in waves
+# Longest wait for a heading from travel alone, or an IMU that fits; then a position with a doubtful heading is better
+# than none.
+_LONGEST_WAIT_S = 30.0
+# Probability of being false, above which several measurements must agree; that of tags and poses is smaller
+_DOUBTFUL = 0.1
+# Fewest, and least share, of them that must agree; longest wait for that. Two false matches of five may agree with each
+# other.
 _AGREEING, _SHARE, _CHOICE_WAIT_S = 3, 0.4, 15.0
-_WHOLE = 1.5  # windows of data up to which it begins at the first data: a start that came a little later is then no other one
-_FIXES = 3  # needed to set a datum
+# Length of the data, in windows, up to which the window begins at the first data: so a little delay changes nothing
+_WHOLE = 1.5
+_FIXES = 3  # fewest fixes to set a datum
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,16 +59,18 @@ class Started:
 
     Attributes:
         datum: origin of world.
-        anchor: the first state of the window, with its prior: without what is measured from there on, which is judged again.
-        pose, velocity, bias: of that state, as solved: at the IMU with the body's axes, in world: gtsam.Pose3, (3,), m/s,
-            (6,), accelerometer first.
+        anchor: first state of the window, with its prior; later measurements are not in it, as the window judges them
+            again.
+        pose, velocity, bias: of the first state, as solved, at the IMU with the body's axes, in world: gtsam.Pose3,
+            (3,) m/s, (6,) accelerometer first.
         heights_m: configured heights (m, up in world), by sensor.
-        heading: where no sensor measures it, how far it may be off; None: one does, or the motion told it.
-        noise_scale: factor on the IMU noise. gyro_noise, accel_noise: beside it, on that of each.
+        heading: how far the heading may be off where no sensor measures it; None: one does, or the motion told it.
+        noise_scale: factor on all of the IMU's noise. gyro_noise, accel_noise: further factors on the noise of each.
         bias_walk: factors on the walk of the biases of accelerometers and of gyroscopes.
         sensor_noise: factors on sigmas of other sensors, by sensor and key of its configuration.
-        before: what slow errors that are left out, and the IMU's mount, did to that state; None: nothing that is known.
-        notes: what the alignment was based on. warnings: on noise that is taken to be larger than configured. rows: ledger rows of what was measured before the first state.
+        before: effect of left-out slow errors and of the IMU's mount on the first state; None: none is known.
+        notes: what the alignment was based on. warnings: on noise that is taken to be larger than configured.
+        rows: ledger rows of the measurements before the first state.
     """
 
     datum: Datum
@@ -90,11 +98,11 @@ def try_start(
     datum: Datum | None,
     near_rad: float | None = None,
 ) -> Started | str:
-    """Return the start, or what it waits for.
+    """Return the start, or in words what it waits for.
 
     Args:
-        datum: origin of world, None where it is to be chosen.
-        near_rad: about the yaw at the first sample, where the motion has told it since: the only one that is tried.
+        setup: of the online mode. imu, measurements: the data so far. datum: origin of world; None: it is to be chosen.
+        near_rad: yaw at the first sample, about, where later motion told it: the only candidate; None: all are tried.
     """
     config = setup.config
     span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 if len(imu) else 0.0
@@ -123,10 +131,11 @@ def try_start(
 
 
 def _missing(setup: Setup, recording: Recording, datum: Datum, *, patient: bool) -> tuple[str, bool]:
-    """Return what position or heading still needs, empty where both are observable, and whether the heading may be taken as told.
+    """Return what position or heading still needs (empty: nothing), and whether sensors or travel tell the heading.
 
     Args:
-        patient: travel was waited for long enough: a craft that circles within less gets a place, and its heading is a guess.
+        patient: whether travel was waited for long enough. Less of it will do then: a craft that circles within a small
+            place gets a position, and its heading is a guess.
     """
     hints = [setup.hint(m, datum) for m in recording.measurements]
     placed = [k for k, h in enumerate(hints) if np.isfinite(h.p_world_m[:2]).all()]
@@ -151,10 +160,10 @@ def _missing(setup: Setup, recording: Recording, datum: Datum, *, patient: bool)
 
 
 def _solved(setup: Setup, recording: Recording, datum: Datum, *, told: bool, near_rad: float | None) -> Started | str:
-    """Return the start as the batch solver solves it, or what it waits for.
+    """Return the start as the batch solver solves it, or in words what it waits for.
 
     Args:
-        told: whether the motion may tell its heading. near_rad: as in `try_start`.
+        told: whether sensors or enough travel tell the heading. near_rad: as in `try_start`.
     """
     config, rows = setup.config, setup.rows
     whole = origin.with_synthetic(recording, config, datum, rows)
@@ -212,7 +221,7 @@ def _span_s(result: BatchResult) -> float:
 
 
 def _undecided(problem: Problem, result: BatchResult) -> str:
-    """Return which measurements that are likely to be false have yet to agree with each other; empty where none have."""
+    """Return which measurements, of those that may well be false, have yet to agree with each other; empty: none."""
     for stream in problem.streams:
         weights = [result.verdicts[(stream.number, i)].weight for i in range(len(stream.measurements))]
         agreeing = sum(weight >= AGREES for weight in weights)
@@ -226,7 +235,7 @@ def _undecided(problem: Problem, result: BatchResult) -> str:
 def _heading(
     setup: Setup, recording: Recording, datum: Datum, result: BatchResult, *, told: bool
 ) -> UnmeasuredHeading | str | None:
-    """Return how far the heading may be off; None where sensors or the motion tell it, a text where the start waits for it."""
+    """Return how far the heading may be off; None: sensors or the motion tell it; a text: the start waits for it."""
     problem = result.problem
     last = keys.pose(len(problem.timeline) - 1)
     R = result.values.atPose3(last).rotation().matrix()
@@ -250,24 +259,24 @@ def _heading(
 
 
 def _measured(setup: Setup, recording: Recording, datum: Datum) -> bool:
-    """Whether sensors measure the heading: by themselves, or along the body's axes, beside positions."""
+    """Return whether sensors measure the heading, themselves or, with positions, by velocities along body axes."""
     heard = {m.sensor for m in recording.measurements}
     along_body = any(heard & setup.config.of_kind(row.kind).keys() for row in setup.rows if row.along_body)
     return along_body or any(np.isfinite(setup.hint(m, datum).yaw_rad) for m in recording.measurements)
 
 
 def _vertical_bias_sigma(R_body_imu: Array, result: BatchResult) -> float:
-    """Return what is known of the gyroscope's bias about the vertical before the motion, 1 sigma, rad/s."""
+    """Return the prior sigma (rad/s) of the gyroscope's bias about the vertical."""
     up = R_body_imu[2]
     return float(np.sqrt(up @ result.prior.bias_cov[3:, 3:] @ up))
 
 
 def _before(result: BatchResult, k: int) -> BeforeStart | None:
-    """Return what was done to state `k`, the first of the window; at the first data nothing has been done yet."""
+    """Return the effect of left-out slow errors and the IMU's mount on state `k`, the window's first; None for 0."""
     if not k:
         return None
     slow = by_mount = None
-    with suppress(RuntimeError, np.linalg.LinAlgError):  # not determined; the window that follows says what it can
+    with suppress(RuntimeError, np.linalg.LinAlgError):  # not determined: the window goes on without it
         slow = unmodelled(result)
     with suppress(RuntimeError, np.linalg.LinAlgError):
         by_mount = followed_before(result.problem, result.values, result.verdicts, result.prior, k)
@@ -275,16 +284,17 @@ def _before(result: BatchResult, k: int) -> BeforeStart | None:
 
 
 def _anchor(result: BatchResult, lag_s: float) -> tuple[int, Anchor]:
-    """Return the state that the window begins at, and its prior from earlier data.
+    """Return the number of the state that the window begins at, and its prior from earlier data.
 
-    In a window that began at the first data, a heading that needed half a minute of travel would have to be found again from ten
-    seconds at a time.
+    If the window always began at the first data, a heading that took half a minute of travel would have to be found
+    again from ten seconds at a time.
     """
     problem, values = result.problem, result.values
     timeline, last = problem.timeline, len(problem.timeline) - 1
     first_ns, last_ns = int(timeline.stamps_ns[0]), int(timeline.stamps_ns[last])
     back = timeline.floor(last_ns - duration_ns(lag_s))
-    # Not at the last node: the prior that closes the slow chains there would be part of the anchor, and count twice.
+    # Not at the last slow node: the prior that closes the slow chains there would be part of the anchor, and count
+    # twice.
     k = int(np.searchsorted(timeline.slow_of, min(timeline.slow_of[back], timeline.slow_of[last] - 1)))
     if k == 0 or last_ns - first_ns <= duration_ns(_WHOLE * lag_s):
         return 0, Anchor.of_start(first_ns, result.prior)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states of the window: each predicted from the one before by the IMU; biases and slow errors by their random walks."""
+"""The states of the window: each predicted by the IMU, biases and slow errors by their random walks."""
 
 from __future__ import annotations
 
@@ -26,16 +26,18 @@ from graphloc.solve.prediction import Prediction, prediction_of
 from graphloc.solve.warnings import late_far_off
 from graphloc.time import NS_PER_S
 
-_HOLE_S = 1.0  # an IMU gap that the motion model is not applied across
-_AWAY_M = 2e3  # no vessel moves so far between two states, even across the longest IMU gap that is bridged
+_HOLE_S = 1.0  # length of an IMU gap from which the motion model is not applied across it
+# Change of the newest position that means divergence: no vessel moves so far, even in the longest gap that is bridged
+_AWAY_M = 2e3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Newest:
-    """The newest solved state; while others are staged, it is not the last of the timeline.
+    """The newest solved state; while further states are staged, it is not the last of the timeline.
 
     Attributes:
-        number: in the timeline. pose, velocity: at the IMU with the body's axes, in world: gtsam.Pose3 and (3,), m/s.
+        number, stamp_ns: in the timeline. pose, velocity: at the IMU with the body's axes, in world: gtsam.Pose3 and
+            (3,), m/s.
         bias: of the IMU. pose_cov: (6, 6), rotation first, in the body tangent. velocity_cov: (3, 3), in world.
         bias_cov: (6, 6), accelerometers first, in the IMU's axes.
     """
@@ -56,16 +58,17 @@ class Newest:
 
 
 def hole_within(links: InertialLink, begin_ns: int, end_ns: int) -> bool:
-    """Return whether the IMU is silent for long in an interval: how the axes that the motion model is about turned is then unknown."""
+    """Return whether the IMU is silent for long in an interval: it is then unknown how the body has turned."""
     return any(a < end_ns and b > begin_ns and b - a > _HOLE_S * NS_PER_S for a, b in links.gaps())
 
 
 def propagated_covariance(cov: Array, newest: Newest, R: Array, dt_s: float, noise: Array) -> Array:
-    """Return a covariance at the newest state propagated by dt_s: across an IMU gap it grows much.
+    """Return a covariance at the newest state, propagated by dt_s.
 
     Args:
-        cov: (n, n), of the pose (body tangent, rotation first), then of states that do not change.
-        R: (3, 3), body in world after dt_s. noise: (9, 9), of the IMU over dt_s, as preintegrated.
+        cov: (n, n), of the pose (body tangent, rotation first), then of states that do not change. newest: the state.
+        R: (3, 3), body -> world after dt_s. noise: (9, 9) covariance of the IMU's preintegration over dt_s; large
+            across a gap.
     """
     turn = np.eye(len(cov))
     turn[:3, :3] = turn[3:6, 3:6] = R.T @ newest.pose.rotation().matrix()
@@ -79,8 +82,9 @@ class States:
     """States from an anchor on, in a window.
 
     Args:
-        constants: shared by measurements; part of every anchor. guess: pose, velocity (3,) and bias (6,) that the first state
-            is first solved at; its prior is the anchor.
+        problem, window: where the states are. constants: shared by measurements; part of every anchor.
+        anchor: prior of the first state. guess: pose, velocity (3,) and bias (6,) that the first state is first solved
+            at.
 
     Raises:
         SolveError: by every method; the window cannot be used afterwards.
@@ -95,7 +99,8 @@ class States:
         guess: tuple[gtsam.Pose3, Array, Array],
     ) -> None:
         self._problem, self._window, self._constants = problem, window, constants
-        # The priors that close the slow chain of each sensor, and the value (k,) that those of its constants are re-weighted at.
+        # By sensor: the prior that closes its slow chain, and the value (k,) by which that prior weighs the constant
+        # components.
         self._ends: dict[str, tuple[Held, Array]] = {}
         self._links: dict[int, Held] = {}  # IMU factors, by the state that each begins at
         state = (keys.pose(0), keys.velocity(0), keys.bias(0))
@@ -152,7 +157,7 @@ class States:
         return newest
 
     def grow(self, stamp_ns: int) -> bool:
-        """Stage the next state, predicted by the IMU; return whether slow states got a new node: then a commit is due."""
+        """Stage the next state, predicted by the IMU; return whether slow states got a new node: commit then."""
         timeline, window, links = self._problem.timeline, self._window, self._problem.links
         k, values = timeline.last, window.values
         j, before_ns = timeline.slow_of[k], timeline.stamps_ns[k]
@@ -204,19 +209,20 @@ class States:
                 if anew
                 else window.values.atVector(key)
             )
-            # Begun at the other level, it would be drawn back to the usual one by the prior that closes the chain, and the pose with it.
+            # The guess includes the step of a jump: begun at the level before it, the slow error would be held at the
+            # usual level by the prior that closes the chain, and the pose would be drawn along.
             window.guess(following, value + (0.0 if step is None else step), t)
             window.add(slow_step(stream.slow, key, following, dt_s, jump_m=jump_m, expected=step, anew=anew))
             if window.remove(self._ends[stream.name][0]):
                 self._ends[stream.name] = window.add(slow_end(stream.slow, following, value)), value
 
     def _jumped(self, stream: LiveStream, j: int, later: int) -> tuple[float, Array | None]:
-        """Return the size (m) of the jumps from slow node j to a later one, and their slow error (k,), as `LiveStream.jumped`."""
+        """Return `LiveStream.jumped` for the interval from slow node j to a later one."""
         timeline = self._problem.timeline
         return stream.jumped(*(timeline.attached_until_ns(timeline.slow_stamps_ns[n]) for n in (j, later)))
 
     def reintegrate(self, stale: Collection[int]) -> None:
-        """Integrate again the IMU steps that begin at these states, and stage their factors: samples in them came late."""
+        """Integrate the IMU steps that begin at the states `stale` again and stage their factors: samples came late."""
         timeline, links, window = self._problem.timeline, self._problem.links, self._window
         for k in sorted(stale):
             if k in self._links and window.remove(self._links[k]):
@@ -243,7 +249,7 @@ class States:
         return True
 
     def prediction(self, stream: LiveStream, at: Attachment, k: int, residual: Residual) -> Prediction:
-        """Return the prediction of a residual at state k, from the joint covariance of pose and slow state."""
+        """Return the prediction of a residual at state k by the covariance of pose and slow state; zeros if unknown."""
         timeline, window, newest = self._problem.timeline, self._window, self._newest
         base = min(k, newest.number)
         wanted, size = [keys.pose(base)], 6
@@ -265,9 +271,9 @@ class States:
         return prediction_of(residual, at, P, newest.velocity_cov)
 
     def covariance(self, slow_of: Sequence[LiveStream]) -> Array:
-        """Return the joint covariance (15 + k, 15 + k) of the newest pose, velocity, bias, and slow errors of some streams.
+        """Return the joint covariance (15 + k, 15 + k) of the newest pose, velocity, bias, and slow errors of streams.
 
-        Rotation and position in axes of world.
+        Rotation and position are in axes of world.
         """
         k, window = self._newest.number, self._window
         j = self._problem.timeline.slow_of[k]
@@ -278,7 +284,10 @@ class States:
         return np.asarray(turn @ joint @ turn.T)
 
     def joint(self, attached: Sequence[Attachment], residuals: Sequence[Residual]) -> Array:
-        """Return the joint covariance of the newest position in world (3 rows first) and of the residuals, as far as the estimate causes it."""
+        """Return the joint covariance of the newest position in world (first 3 rows) and of the residuals.
+
+        The residuals' part is the covariance of their prediction: the noise of the measurements is not in it.
+        """
         newest, window = keys.pose(self._problem.timeline.last), self._window
         poses = list(dict.fromkeys([newest, *(at.pose_key for at in attached)]))
         slow = list(dict.fromkeys(at.slow_key for at in attached if at.slow_key is not None))
@@ -296,7 +305,7 @@ class States:
         return np.asarray(J @ window.covariance([*poses, *slow]) @ J.T)
 
     def late_far_off(self, stream: LiveStream) -> list[tuple[str, float, str]]:
-        """Return `TIME_OFFSET`, by how much, and a line where the stamps of a sensor, by its slow state, are clearly far from where they are set."""
+        """Return `TIME_OFFSET`, the delay (s) in the slow state and a line, if that is clearly far from the setting."""
         if stream.slow is None or (axis := stream.slow.late) is None:
             return []
         key = keys.slow(stream.number, self._problem.timeline.slow_of[self._newest.number])
@@ -304,12 +313,12 @@ class States:
             return []
         late_s = float(self._window.values.atVector(key)[axis])
         said = late_far_off(stream.name, stream.slow, late_s)
-        # The sigma is asked for last: it takes time.
+        # The sigma is computed last, because it takes time.
         clear = said and abs(late_s) > FAR_OFF * np.sqrt(self._window.covariance([key])[axis, axis])
         return [(TIME_OFFSET, late_s, line) for line in said] if clear else []
 
     def links(self) -> list[Held]:
-        """Return the IMU factors, but for the oldest tenth: the solver cannot relinearise the poses there."""
+        """Return the IMU factors without the oldest tenth: the solver cannot relinearise the poses there."""
         held = [held for _, held in sorted(self._links.items()) if held.slots]
         return held[len(held) // 10 + 1 :]
 
@@ -319,12 +328,16 @@ class States:
         return float(np.median(steps)) if steps else 0.0
 
     def steps_cost(self, since_ns: int) -> float:
-        """Return the cost of the IMU factors that reach beyond a stamp, together."""
+        """Return the summed cost of the IMU factors that reach beyond a stamp."""
         first = self._problem.timeline.floor(since_ns)
         return sum(self._window.errors_of(held for k, held in self._links.items() if k >= first and held.slots))
 
     def anchor(self) -> Anchor:
-        """Return the anchor at the newest state, without the priors that close the slow chains, which continue from here, and without what may be weighed otherwise."""
+        """Return the anchor at the newest state.
+
+        It leaves out the priors that close the slow chains, as the chains continue from here, and the parts of other
+        priors that may be weighed otherwise later.
+        """
         timeline, window, streams = self._problem.timeline, self._window, self._problem.streams
         k = timeline.last
         j = timeline.slow_of[k]
@@ -354,7 +367,7 @@ class States:
         return replace(anchor, constants={**self._constants.remembered(), **anchor.constants})
 
     def track(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
-        """Return stamps (N,), ns, and in world positions (N, 3), attitudes (N, 3, 3) and velocities (N, 3) of the body's origin."""
+        """Return stamps (N,), ns; and positions (N, 3), attitudes (N, 3, 3), velocities (N, 3) of the body in world."""
         timeline, values, lever = self._problem.timeline, self._window.values, -self._problem.t_body_imu_m
         states = range(timeline.first, len(timeline))
         poses = [values.atPose3(keys.pose(k)) for k in states]

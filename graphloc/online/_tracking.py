@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An estimate that is underway: the sliding window follows the IMU, and is rebuilt from an earlier state where it fails."""
+"""An estimate underway: the sliding window follows the IMU, and is rebuilt from an earlier state if it fails."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ from graphloc.time import duration_ns, stamps_of, utc_text
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
-_AT_ONCE = 10  # states that are made in one commit, in a gap of the IMU
-_PENDING = 10_000  # measurements that may wait for the IMU
-_TOLD_S = 60.0  # of data, by which the motion may tell a heading that was a guess
+_AT_ONCE = 10  # most states that one commit makes, after a gap of the IMU
+_PENDING = 10_000  # most measurements that may wait for the IMU
+_TOLD_S = 60.0  # length of the data by which the motion may tell a heading that was a guess
 _FROZEN = f"{FROZEN_ONLINE}; its fixes are rejected until it moves"
 _NO_LONGER_FROZEN = "no longer frozen: its fixes are used again"
 
@@ -50,9 +50,10 @@ class Tracking:
     """The window of one start, what waits to enter it, and what it can be rebuilt from.
 
     Args:
-        persistent: state outside the window, updated as the window moves on. ledger: where measurements get their rows.
-        anchor: the state that the window begins at. samples: of the IMU, from there or before to the newest.
-        guess: pose, velocity (3,) and bias (6,) that this state is first solved at; default: the anchor's.
+        setup: of the online mode. persistent: state outside the window, updated as the window moves on.
+        ledger: where measurements get their rows.
+        anchor: the state that the window begins at. samples: of the IMU, from the anchor or before it to the newest.
+        guess: pose, velocity (3,) and bias (6,) that the anchor's state is first solved at; default: the anchor's own.
 
     Attributes:
         lag: the window; another object after a rebuild.
@@ -71,12 +72,12 @@ class Tracking:
         guess: tuple[gtsam.Pose3, Array, Array] | None = None,
     ) -> None:
         self._setup, self._persistent, self._ledger = setup, persistent, ledger
-        self._pending: list[Measurement] = []  # ahead of the IMU, by stamp
-        self._unread: list[ImuSample] = []  # not yet handed to the window
+        self._pending: list[Measurement] = []  # measurements that wait for the IMU to reach them, by stamp
+        self._unread: list[ImuSample] = []  # samples not yet handed to the window
         self._holes: list[tuple[int, int]] = []  # stamps (ns) between which samples came late
-        self._height_due_ns: dict[str, int] = {}  # of the next configured height, by sensor
+        self._height_due_ns: dict[str, int] = {}  # stamp of the next configured height, by sensor
         self._recent, self._doubt = Recent(), ImuDoubt()
-        self._held_out: list[ImuSample] = []  # left out since the last gap began, or went on
+        self._held_out: list[ImuSample] = []  # samples left out since the last gap began, or was lengthened
         self.lag = self._built(anchor, samples, guess)
         if persistent.odometry is None:
             pose = self.lag.newest.pose
@@ -92,7 +93,7 @@ class Tracking:
         guess: tuple[gtsam.Pose3, Array, Array] | None = None,
         before: Lag | None = None,
     ) -> Lag:
-        """Return a window that begins at an anchor; `before`: the one that it replaces."""
+        """Return a window that begins at an anchor; `before`: the window that it replaces, if it does."""
         persistent = self._persistent
         setup = self._setup.scaled(persistent.sensor_noise.times)
         since_ns = anchor.stamp_ns - 2 * duration_ns(setup.gap_s)
@@ -136,14 +137,14 @@ class Tracking:
             self._ledger.drop(self._pending.pop(), Outcome.REJECTED, "too many measurements wait for the IMU")
 
     def taken_back(self, sensor: str) -> list[Measurement]:
-        """Return what waits for the IMU of a sensor, and keep it no more."""
+        """Return the measurements of a sensor that wait for the IMU, and keep them no more."""
         back = [m for m in self._pending if m.sensor == sensor]
         self._pending = [m for m in self._pending if m.sensor != sensor]
         self._recent.forget(back)
         return back
 
     def keep_imu(self, m: ImuSample, hole: tuple[int, int] | None) -> None:
-        """Keep an IMU sample; `hole`: of one that came late, the stamps (ns) of the samples before and after it."""
+        """Keep an IMU sample; `hole`: stamps (ns) of the samples before and after it, if it came late."""
         if self._held_out and self._doubt.over(m.stamp_ns):
             if (wrong := self._goes_on_wrong()) is not False:
                 self._doubt.go_on()
@@ -169,7 +170,7 @@ class Tracking:
     def catch_up(
         self, anchor: Anchor, samples: Sequence[ImuSample], others: Sequence[Measurement], until_ns: int
     ) -> None:
-        """Bring a window that has just begun at an anchor to a stamp, with the measurements that the start was made of."""
+        """Bring a window that has just begun at an anchor up to a stamp, with the data of the start."""
         self._pending = [m for m in others if not self._ledger.has(m)]
         while self._pending and self._pending[0].stamp_ns < self.lag.first_ns:
             self._ledger.drop(self._pending.pop(0), Outcome.REJECTED, "no IMU data at this stamp")
@@ -182,7 +183,7 @@ class Tracking:
         self._ledger.used(newest)
 
     def advance(self, until_ns: int) -> None:
-        """Make the states that are due up to a stamp, with the measurements that belong to them: an update."""
+        """Make an update: the states that are due up to a stamp, with the measurements that attach to them."""
         self._odometry.begin()
         self._extend(until_ns)
 
@@ -201,9 +202,9 @@ class Tracking:
         self._ledger.enter(lag.gone())
 
     def _follow_unmodelled(self) -> None:
-        """Bring what left-out slow errors and the IMU's mount do to the newest state up to date; where that fails, they do what they did before.
+        """Bring the effect of left-out slow errors and of the IMU's mount up to the newest state; on failure it stays.
 
-        It is only about bounds: a window that is right must not be given up for it.
+        Only the bounds depend on this: a window that is right must not be given up for it.
         """
         lag, unmodelled = self.lag, self._persistent.unmodelled
         if unmodelled is None:
@@ -218,7 +219,7 @@ class Tracking:
             self._persistent.unmodelled = lag.unmodelled(last=unmodelled.sizes)
 
     def _read_imu(self) -> None:
-        """Hand the samples that have arrived to the window; where they came late, integrate anew."""
+        """Hand the samples that have arrived to the window, and integrate anew where some came late."""
         if self._unread:
             stamps = stamps_of(self._unread)
             readings = np.array([np.hstack([m.accel_mps2, m.gyro_radps]) for m in self._unread])
@@ -229,13 +230,13 @@ class Tracking:
             self.lag.reintegrate(holes)
 
     def solve_late_imu(self) -> None:
-        """Solve with the IMU samples that came late since the newest state: it was predicted across the holes that they fill."""
+        """Solve again if IMU samples came late since the newest state, which was predicted without them."""
         if self._holes:
             self._read_imu()
             self.lag.commit()
 
     def _grow(self, until_ns: int) -> None:
-        """Stage the next states: as many as one commit takes."""
+        """Stage the next states: until slow states get a new node, but at most `_AT_ONCE`."""
         timeline, made, closed = self.lag.problem.timeline, 0, False
         while timeline.due_ns <= until_ns and made < _AT_ONCE and not closed:
             closed = self.lag.grow(timeline.due_ns)
@@ -269,7 +270,7 @@ class Tracking:
                 self._recent.forget([m])
 
     def keep_anchor(self) -> bool:
-        """Remember the newest state as an anchor, if that is due, and forget what no rebuild needs; tell whether it was due."""
+        """Keep the newest state as an anchor if one is due, and forget what no rebuild needs; return whether it was."""
         told_ns = self._doubt.told_by(self.lag.first_ns)
         guessed = self._persistent.heading is not None
         since_ns = self.lag.newest.stamp_ns - duration_ns(_TOLD_S) if guessed else None
@@ -314,15 +315,15 @@ class Tracking:
         return self._guess.measured(self.lag.first_ns, self.lag.newest.stamp_ns)
 
     def since(self, stamp_ns: int) -> list[Measurement]:
-        """Return what has come with stamps from `stamp_ns` on and can be used again, by stamp: what came late is among it."""
+        """Return the measurements from a stamp on that can be used again, by stamp; late ones are among them."""
         again = (m for m in self._recent if m.stamp_ns >= stamp_ns and not self._ledger.has(m))
         return sorted(again, key=lambda m: m.stamp_ns)
 
     def told_by(self) -> tuple[list[Measurement], float]:
-        """Return the data by which the motion has told a heading, by stamp, and about what yaw, rad, the body had at the first of them.
+        """Return the data by which the motion has told a heading, by stamp, and about the yaw (rad) at their first.
 
-        The gyroscope carries the yaw of the newest state back to there, its bias not removed. Data whose ledger row is written, or will
-        be written with the window, have no arrival number (seq -1).
+        The yaw is that of the newest state, carried back by the gyroscope, whose bias is not removed. Data whose ledger
+        row is written, or will be with the window, get arrival number -1.
         """
         lag = self.lag
         since_ns = min(lag.newest.stamp_ns - duration_ns(_TOLD_S), lag.first_ns)
@@ -337,9 +338,10 @@ class Tracking:
         return came, float(yaw_from_rotation(R)) - float(np.trapezoid(rates, stamps_of(samples) * 1e-9))
 
     def trajectory(self, now: Estimate) -> Trajectory:
-        """Return the states of the window, and `now` where it is newer; the covariance at all of them is that of `now`.
+        """Return the states of the window, and `now` if it is newer; all get the covariance of `now`.
 
-        Without what matches add by contradicting a receiver: scans are matched around this, and a wider search finds more false ones.
+        That is without what receivers add by contradicting matches (`Lag.contradicted`): scans are matched around this
+        trajectory, and a wider search finds more false matches.
         """
         stamps, p, R, v = self.lag.track()
         if now.stamp_ns > stamps[-1]:
@@ -351,7 +353,7 @@ class Tracking:
         return Trajectory(stamps_ns=stamps, p_world_m=p, R_world_body=R, v_world_mps=v, cov=cov)
 
     def news(self) -> list[Event]:
-        """Return what the newest state newly shows: a wrong heading, frozen receivers, position jumps, noise."""
+        """Return events on what the newest state newly shows: of heading, receivers, jumps, noise and settings."""
         check, at_ns, known = self._persistent.heading_check, self.lag.newest.stamp_ns, self._persistent.heading
         guessed = known is not None and known.doubt(at_ns) != ""
         heading = [Event(check.said)] if check.look(self.lag, guessed=guessed) else []
@@ -374,7 +376,7 @@ class Tracking:
         ]
 
     def snapshot(self, newest: ImuSample) -> Snapshot:
-        """Return the last anchor and all that is needed to go on from it; `newest`: sample of the IMU."""
+        """Return a snapshot of the last anchor; `newest`: the newest IMU sample."""
         anchor = self._recent.anchors[-1]
         sample = self._recent.sample_at(anchor) or newest
         return self._persistent.snapshot(self._setup, anchor, sample, self.lag.agreed_ns)
@@ -382,17 +384,20 @@ class Tracking:
     # Rebuild, end
 
     def rebuild(self, why: str, until_ns: int, misled: float = 1.0) -> str:
-        """Build the window anew: with all that is in it, or, if that fails too, from the last anchor without what came since.
+        """Build the window anew.
+
+        It begins at its first anchor, with all its measurements; if that fails, at the last anchor, without later
+        measurements.
 
         Args:
             why: what failed. until_ns: stamp of the newest IMU sample.
-            misled: how many times larger the covariance of earlier states is than they were estimated with.
+            misled: factor by which to enlarge the covariances of the anchors (`ImuNoise.misled`).
 
         Returns:
             What has happened, in one line.
 
         Raises:
-            SolveError: neither could be solved; the window is the one that failed.
+            SolveError: neither could be solved; the window is still the one that failed.
         """
         failed, recent, ledger = self.lag, self._recent, self._ledger
         ledger.enter(failed.gone())
@@ -415,7 +420,7 @@ class Tracking:
                 recent.anchors = deque([anchor])
             streams, known = self.lag.problem.streams, failed.problem.streams
             jumps = [j.after_ns for name, s in streams.items() for j in s.jumps if j not in known[name].jumps]
-            if jumps:  # at the anchors since, its slow error was that before it
+            if jumps:  # later anchors have the slow error from before the jump
                 recent.forget_anchors(min(jumps))
             self._settle_rows(failed, again)
             age_s = (self.lag.newest.stamp_ns - anchor.stamp_ns) * 1e-9
@@ -429,7 +434,7 @@ class Tracking:
         return [a for a in self._recent.anchors if a.stamp_ns >= self.lag.first_ns]
 
     def _again_from(self, anchor: Anchor) -> list[Measurement]:
-        """Return what can be used again in a window that begins at an anchor, but for the IMU samples, by stamp."""
+        """Return the measurements, by stamp, that a window from an anchor on can use again; without IMU samples."""
         return [m for m in self.since(anchor.stamp_ns) if not isinstance(m, ImuSample)]
 
     def _rebuild_from(self, anchor: Anchor, measurements: Sequence[Measurement], until_ns: int) -> None:
@@ -439,13 +444,15 @@ class Tracking:
         self.lag.settle()
 
     def doubt_imu(self, until_ns: int) -> str | None:
-        """Try the samples of the IMU as a gap where sensors that do not know each other deny the estimate (see `_imu_doubt`).
+        """If independent sensors deny the estimate together, try the IMU samples since then as a gap.
+
+        See `_imu_doubt`.
 
         Args:
             until_ns: stamp of the newest IMU sample.
 
         Returns:
-            None: nothing has changed. Else the window is another, and this is to be said; empty: it was said before.
+            None: nothing has changed. Else the window was rebuilt, and this is a line for users; empty: users know it.
         """
         denied, replaced, anchors = self.lag.denied, self.lag, self._anchors()
         since_ns = self._doubt.suspected(denied, until_ns) if denied else None
@@ -475,11 +482,12 @@ class Tracking:
         )
 
     def _begin_trial(self, since_ns: int, until_ns: int) -> Callable[[], None]:
-        """Leave out the samples of the IMU between two stamps, and let the window be rebuilt; return what takes back both."""
+        """Leave out the IMU samples between two stamps, for a rebuild of the window; return a function to undo it."""
         ledger, recent, persistent = self._ledger, self._recent, self._persistent
         mark, lag, pending, height_due_ns = ledger.marked(), self.lag, self._pending, self._height_due_ns
         doubt = deepcopy(self._doubt)
-        # What learns from each measurement would from the trial as well, so that one has copies.
+        # Objects that learn from each measurement are replaced by copies, so that a trial that fails leaves no trace in
+        # them.
         receivers, check, model = persistent.receivers, persistent.heading_check, persistent.motion_model
         scatters = {name: deepcopy(stream.scatter) for name, stream in lag.problem.streams.items()}
         persistent.receivers, persistent.motion_model = deepcopy(receivers), deepcopy(model)
@@ -501,7 +509,7 @@ class Tracking:
         return take_back
 
     def _goes_on_wrong(self) -> bool | None:
-        """Return whether the samples that were left out last contradict the states that were made without them; None: too few to tell."""
+        """Return whether the samples left out last contradict the states made without them; None: too few to tell."""
         lag, out = self.lag, sorted(self._held_out, key=lambda m: m.stamp_ns)  # late ones are among them
         stamps_ns, _, R, _ = lag.track()
         first, end = np.searchsorted(stamps_ns, [out[0].stamp_ns, out[-1].stamp_ns + 1])
@@ -515,20 +523,20 @@ class Tracking:
         return turns_otherwise(stamps_of(held), rates, R[first].T @ R[end - 1])
 
     def end(self, reason: str) -> None:
-        """Give every measurement its row; `reason`: of those that the states have not reached."""
+        """Give every measurement its ledger row; `reason`: for measurements that the states have not reached."""
         self._ledger.enter([*self.lag.gone(), *self.lag.held()])
         for m in self._pending:
             self._ledger.drop(m, Outcome.REJECTED, reason)
 
     def end_but(self, since_ns: int) -> list[Measurement]:
-        """Give every measurement its row, but those since a stamp (ns), which are returned to start anew with."""
+        """Give every measurement its ledger row; return those since a stamp (ns) instead, to start anew from them."""
         self._ledger.enter(self.lag.gone())
         again = self.since(since_ns)
         self._settle_rows(self.lag, again)
         return again
 
     def _settle_rows(self, replaced: Lag, again: Iterable[Measurement]) -> None:
-        """Give the measurements of a window that was replaced their rows, but for what is used again."""
+        """Give the measurements of a replaced window their ledger rows, but not those used again."""
         used_again = {m.seq for m in again}
         self._ledger.enter([row for row in replaced.held() if row.seq not in used_again])
         for m in self._recent.others():

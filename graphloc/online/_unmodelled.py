@@ -1,20 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the slow errors that are left out of the window (`LiveStream.left_out`), and a mount of the IMU that is off, do to its newest state.
+"""Effect of left-out slow errors (`LiveStream.left_out`), and of a wrong IMU mount, on the window's newest state.
 
-Nothing tells such an error d from motion, so the estimate follows it: in position by all of it, in heading and velocity by as
-much as the IMU lets it; once no fixes come, in position by what that velocity makes of it. Its covariance is that of a consider parameter (Schmidt 1966) of the filter that the newest state is:
-with F, Q from one state to the next, J the information of all measurements since and J_p that of the fixes on the position,
+Nothing tells a left-out error d from motion, so the estimate follows it: in position by all of d, in heading and
+velocity as far as the IMU allows it. While no fixes come, the error of the velocity adds to that of the position. The
+newest state is that of a filter, and d is a consider parameter of it (Schmidt 1966). With
+
+- e: error of the newest state that d causes; P: covariance of that state without d;
+- F, Q: transition and process noise from one state to the next;
+- J: information of all measurements since the last state; J_p: that of the fixes, on the position;
+- +: after the step,
 
     P+ = ((F P F' + Q)^-1 + J)^-1,    e+ = (1 - P+ J) F e + P+ J_p d
 
-An IMU whose mount is turned by m, body axes, measures the motion of a body that is turned as much, e + U m, and the sensors that of
-the body; so that becomes (1 - P+ J) F (e + U m) + P+ J U+ m, which is linear in m.
+If the IMU's mount is turned by m, body axes, the IMU measures the motion of a body turned by U m, and the other sensors
+that of the true body. The error against the turned body then obeys e+ + U+ m = (1 - P+ J) F (e + U m) + P+ J U+ m,
+which is linear in m.
 
-The state has the slow errors of the other sensors with it: a compass whose mount offset is unknown holds a heading for a while,
-but does not tell it. P is computed here, not taken from the window: that is linearised anew now and then, and judges older
-measurements again, which its covariances of two states do not tell from what was measured between them. Offline:
-`graphloc.solve.unmodelled`, `graphloc.solve.imu_mount`, where m is estimated, too. Where the window has the motion model (`graphloc.motion_model`),
-F and Q have it, without its kernel. Not handled: what comes late counts as measured at the newest state.
+The state includes the slow errors of the other sensors: a compass whose mount offset is unknown holds a heading for a
+while, but does not tell it. P is computed here and not taken from the window. The window is relinearised now and then,
+and judges older measurements again; its covariances of two states do not separate that from the measurements between
+them. Where the window has the motion model (`graphloc.motion_model`), F and Q include it, without its kernel.
+
+Offline: `graphloc.solve.unmodelled`; `graphloc.solve.imu_mount`, where m is estimated, too. Not handled: late
+measurements count as measured at the newest state.
 """
 
 from __future__ import annotations
@@ -40,12 +48,17 @@ from graphloc.time import NS_PER_S
 
 _ROTATION, _POSITION, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 _CORE = 15  # rotation, position, velocity, bias
-# To save time, where nothing but the mount is left out: what that does changes over seconds; a choice.
+# Time between updates where only the mount has an effect, to save time: that effect changes over seconds; a choice.
 _MOUNT_EVERY_S = 0.5
 
 
 class BeforeStart(NamedTuple):
-    """What has been done to the first state of a window before it: by left-out errors; and the first rows (9, 3) of `by_mount`."""
+    """Effect on the first state of a window by data before the window.
+
+    Attributes:
+        slow: of left-out slow errors; None: not known. by_mount: (9, 3) first rows of `UnmodelledError.by_mount`; None:
+            not known.
+    """
 
     slow: Unmodelled | None
     by_mount: Array | None
@@ -58,21 +71,23 @@ class ErrorSizes(NamedTuple):
     by_mount: Array
 
     def fits(self, other: ErrorSizes) -> bool:
-        """Whether it is finite, and as large as the other one."""
+        """Return whether all arrays are finite and have the shapes of the other's."""
         same = all(a.shape == b.shape for a, b in zip(self, other, strict=True))
         return same and all(bool(np.isfinite(a).all()) for a in self)
 
 
 @dataclass(slots=True, eq=False)
 class UnmodelledError:
-    """What the left-out errors of some receivers, and the mount of the IMU, do to the newest state.
+    """Effect of the left-out slow errors of r receivers, and of the IMU's mount, on the newest state.
 
     Attributes:
-        left_out: their processes, by receiver. estimated: those of the slow errors that the window estimates, by sensor.
-        cov: (n + 3 m, n + 3 m) of e (rotation, position, velocity in axes of world; bias; slow errors that are estimated) and of the m
-            errors (east, north, up).
-        by_mount: (n, 3) change of e + U m per turn m of the IMU's mount, body axes. mount_sigma_rad: of it, each axis.
-        newest: the state that it is of. P: (n, n), covariance of that state without the errors, axes as of e.
+        left_out: processes of the left-out slow errors, by receiver. estimated: of the slow errors in the window, by
+            sensor.
+        cov: (n + 3 r, n + 3 r) covariance of e (rotation, position, velocity in axes of world; bias; estimated slow
+            errors) and of the left-out slow errors (east, north, up each).
+        by_mount: (n, 3) derivative of e + U m by the turn m of the IMU's mount, body axes. mount_sigma_rad: 1 sigma of
+            m, each axis.
+        newest: the newest state. P: (n, n), its covariance without these effects, in the order and axes of e.
     """
 
     left_out: Mapping[str, SlowProcess]
@@ -87,14 +102,15 @@ class UnmodelledError:
     def at(
         cls, problem: LiveProblem, newest: Newest, P: Array, begun: BeforeStart | None, last: ErrorSizes | None
     ) -> UnmodelledError | None:
-        """Return the error of a window's first state, whose position is off by the whole of each left-out error.
+        """Return the effect on a window's first state, whose position is off by the whole of each left-out error.
 
         None where no error is left out and the IMU's mount is known exactly.
 
         Args:
-            newest, P: first state, and its covariance without these errors.
-            begun: what the errors did to that state before the window began; None: nothing.
-            last: sizes at the end of the window before, taken over where their shapes fit these streams; None: there are none.
+            problem: of the window. newest, P: first state, and its covariance without these effects.
+            begun: effect of data before the window; None: none.
+            last: sizes at the end of the window before, taken over if their shapes fit these streams; None: there are
+                none.
         """
         streams = problem.streams
         left_out = untold_errors(list(streams.values()))
@@ -107,12 +123,13 @@ class UnmodelledError:
         of_errors[_POSITION] = np.tile(np.eye(3), m)
         sigma = np.concatenate([np.zeros(0), *(slow.sigma for slow in left_out.values())])
         cov = of_errors @ np.diag(sigma**2) @ of_errors.T
-        # Beside a heading that is off, the offset of a compass that agrees with it is off too.
+        # If the heading is off, so is the estimated offset of a compass that agrees with it.
         turned = np.vstack([np.eye(3), np.linalg.solve(P[_ROTATION, _ROTATION], P[_ROTATION, _CORE:]).T])
         rows = np.r_[_ROTATION, _CORE:n]
         R = newest.pose.rotation().matrix()
         by_mount = np.zeros((n, 3))
-        by_mount[2] = R[2]  # at the first data the IMU has levelled itself, and sensors tell the heading of the body
+        # At the first data the IMU levels itself, so roll and pitch follow m; sensors tell the heading of the body
+        by_mount[2] = R[2]
         if begun is not None and begun.slow is not None:
             cov[np.ix_(rows, rows)] += turned @ begun.slow.rotation @ turned.T
             cov[_VELOCITY, _VELOCITY] += begun.slow.velocity
@@ -126,24 +143,26 @@ class UnmodelledError:
 
     @property
     def sizes(self) -> ErrorSizes:
-        """What a window that takes over from this one needs."""
+        """The sizes that a window which replaces this one takes over."""
         return ErrorSizes(self.cov, self.by_mount)
 
     def due(self, stamp_ns: int) -> bool:
-        """Whether it must be brought up to a stamp: what a mount does changes slowly."""
+        """Return whether the effect must be brought up to a stamp; that of the mount alone changes slowly."""
         return bool(self.left_out) or stamp_ns - self.newest.stamp_ns >= _MOUNT_EVERY_S * NS_PER_S
 
     def advance(
         self, newest: Newest, links: InertialLink, told: Mapping[str, Array], motion_model: MotionModel
     ) -> None:
-        """Follow the window to its newest state; nothing where that is not newer than the last (a window that was rebuilt).
+        """Follow the window to its newest state; nothing changes if that is not newer than the last (a rebuild).
 
         Args:
-            told: by sensor, information of what it measured since the last state: (9, 9) on rotation, position, velocity of the state,
-                in axes of world; where its slow error is estimated, (9 + k, 9 + k) with that.
+            newest: the newest state. links: preintegration of the IMU. motion_model: of the vessel.
+            told: by sensor, information of its measurements since the last state: (9, 9) on rotation, position,
+                velocity of the state, in axes of world; if its slow error is estimated, (9 + k, 9 + k) with that.
 
         Raises:
-            ArithmeticError: the result is not finite. numpy.linalg.LinAlgError, RuntimeError: there is none. Nothing has changed then.
+            ArithmeticError: the result is not finite. numpy.linalg.LinAlgError, RuntimeError: there is no result.
+                Nothing has changed then.
         """
         if newest.stamp_ns <= self.newest.stamp_ns:
             return
@@ -180,13 +199,14 @@ class UnmodelledError:
         self.newest, self.P, self.cov, self.by_mount = newest, P, 0.5 * (cov + cov.T), by_mount
 
     def pose(self, lever_m: Array, ahead_s: float = 0.0) -> Array:
-        """Return the covariance (6, 6) that comes on top of that of the place of a point of the body, and of the attitude, in axes of world.
+        """Return the covariance (6, 6) to add to that of a point of the body and of the attitude, in axes of world.
 
-        The place is off by the standing size of the left-out errors at least. A height that is taken from the fixes once is, too, though
-        here it counts as measured.
+        The variance of the position is at least the standing one of the left-out errors. That also covers a height that
+        was taken once from the fixes, although it counts as measured here.
 
         Args:
-            lever_m: (3,) the point from the IMU, axes of world. ahead_s: for how long the newest state is propagated by the IMU.
+            lever_m: (3,) from the IMU to the point, axes of world. ahead_s: for how long the newest state is propagated
+                by the IMU.
         """
         of_point = np.zeros((6, 9))
         of_point[:3, _ROTATION], of_point[:3, _POSITION], of_point[:3, _VELOCITY] = (
@@ -204,18 +224,18 @@ class UnmodelledError:
 
     @property
     def velocity(self) -> Array:
-        """Covariance (3, 3) that comes on top of the velocity's, m^2/s^2."""
+        """Covariance (3, 3), m^2/s^2, to add to that of the velocity."""
         by = self.by_mount[_VELOCITY]
         return np.asarray(self.cov[_VELOCITY, _VELOCITY] + self.mount_sigma_rad**2 * by @ by.T)
 
 
 def estimated_beside(streams: Mapping[str, LiveStream]) -> list[tuple[LiveStream, SlowProcess]]:
-    """Return the streams whose slow errors are estimated and not left out, and these."""
+    """Return the streams whose slow errors are estimated and not left out, each with its slow error."""
     return [(s, s.slow) for s in streams.values() if s.slow is not None and s.left_out is None]
 
 
 def _walks(processes: Iterable[SlowProcess], dt_s: float) -> tuple[Array, Array]:
-    """Return what is left of slow errors after a time, and the covariance that has come to them."""
+    """Return the transition matrix (k, k) of slow errors over a time, and the covariance (k, k) of their walk."""
     steps = [process.after(dt_s) for process in processes]
     kept, walk = (np.concatenate([np.zeros(0), *(step[n] for step in steps)]) for n in (0, 1))
     return np.diag(kept), np.diag(walk)
@@ -224,9 +244,9 @@ def _walks(processes: Iterable[SlowProcess], dt_s: float) -> tuple[Array, Array]
 def _by_motion_model(
     model: MotionModel, before: Newest, newest: Newest, P: Array, F: Array, Q: Array
 ) -> tuple[Array, Array]:
-    """Return F and the predicted covariance (n, n) where the motion model holds the velocity, too.
+    """Return F and the predicted covariance (n, n) if the motion model constrains the velocity, too.
 
-    It measures b' v_b - phi a' v_a, with the variance of w (see `graphloc.motion_model`).
+    It acts as a measurement of b' v_b - phi a' v_a, with the variance of w (see `graphloc.motion_model`).
     """
     a, b = (state.pose.rotation().matrix()[:, :2].T for state in (before, newest))
     phi, variance = model.process(a @ before.velocity, (newest.stamp_ns - before.stamp_ns) / NS_PER_S)
@@ -241,7 +261,7 @@ def _by_motion_model(
 
 
 def _step(before: Newest, newest: Newest, links: InertialLink) -> tuple[Array, Array]:
-    """Return F and Q (15, 15), in axes of world, from one state to the next, by the IMU."""
+    """Return F and Q (15, 15), in axes of world, from one state to the next by the IMU."""
     start = gtsam.NavState(before.pose, before.velocity)
     pim = links.integrate(
         before.stamp_ns, newest.stamp_ns, gtsam.imuBias.ConstantBias(), GapMotion.of(start, before.bias)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements held while there is no estimate."""
+"""Measurements that are held while there is no estimate."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from graphloc.online._ledger import OnlineLedger
 from graphloc.online._start import LEAST_S
 from graphloc.time import duration_ns
 
-_TRY_EVERY_S, _TRY_AGAIN = 0.5, 0.15  # of a start
-_LONGEST_S, _MOST = 120.0, 50_000  # what is older, or beyond this number, is dropped
+# Least time between two tries to start, and the same as a share of the wait so far
+_TRY_EVERY_S, _TRY_AGAIN = 0.5, 0.15
+_LONGEST_S, _MOST = 120.0, 50_000  # greatest age and number of the measurements that are held; the oldest are dropped
 
 
 class Waiting:
@@ -39,7 +40,7 @@ class Waiting:
             self._let_go()
 
     def due(self, newest_ns: int) -> bool:
-        """Whether a start should be tried now; the more data there is to solve, the less often."""
+        """Return whether a start should be tried now; the more data there are to solve, the less often."""
         while newest_ns - self._held[0].stamp_ns > _LONGEST_S * 1e9:
             self._let_go()
         waited_ns = newest_ns - self._held[0].stamp_ns - duration_ns(LEAST_S)
@@ -53,16 +54,16 @@ class Waiting:
         return [m for m in self._held if isinstance(m, ImuSample)]
 
     def others(self) -> list[Measurement]:
-        """Return all but the IMU samples."""
+        """Return all measurements but the IMU samples."""
         return [m for m in self._held if not isinstance(m, ImuSample)]
 
     def taken(self) -> list[Measurement]:
-        """Return all, and hold nothing any more."""
+        """Return all measurements, and hold none any more."""
         held, self._held = self._held, []
         return held
 
     def refuse(self, reason: str) -> None:
-        """Enter all into the ledger as rejected."""
+        """Enter all measurements into the ledger as rejected, and hold none any more."""
         for m in self.taken():
             self._ledger.drop(m, Outcome.REJECTED, reason)
 

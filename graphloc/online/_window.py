@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The graph of the window: iSAM2, whose oldest keys are marginalised.
 
-Additions and removals are staged, and applied whole or not at all. `ISAM2` is not usable after an exception: the caller then
-throws it away and builds another.
+Additions and removals are staged, and applied whole or not at all. `ISAM2` cannot be used after an exception: the
+caller then throws the window away and builds another.
 
-GTSAM's own fixed-lag smoother orders elimination by fill-in alone. Here the newest keys come last: what is queried and added
-at every update is then at the root of the Bayes tree.
+GTSAM's own fixed-lag smoother orders elimination by fill-in alone. Here the newest keys come last, so that what every
+update queries and adds is at the root of the Bayes tree.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from graphloc.frames import Array
 from graphloc.keys import is_leaf, is_pose
 from graphloc.solve.linearised import sparse_rows
 
-_RELINEARIZE = 0.02  # of any tangent: m, rad, m/s; the gap to the batch is millimetres
+# Change of any tangent component (m, rad, m/s) from which a key is relinearised; millimetres from the batch
+_RELINEARIZE = 0.02
 _NEVER = 1_000_000_000  # updates
 
 
@@ -35,7 +36,7 @@ def keys_of(factor: Any) -> list[int]:
 
 @dataclass(slots=True, eq=False)
 class Held:
-    """Factors that were added together: their slots in iSAM2, and their keys."""
+    """Factors that were added together: keys, number, and slots in iSAM2 (none while staged or removed)."""
 
     keys: frozenset[int]
     count: int
@@ -43,9 +44,9 @@ class Held:
 
 
 class LazyEstimates:
-    """Values of the keys of a window, as of its last commit, and the guess of those staged since.
+    """Estimates of the keys of a window as of its last commit, and the guesses of keys staged since.
 
-    Each is computed when it is asked for: nine of ten, of leaves and older states, never are.
+    Each is computed only when it is asked for: nine of ten never are, those of leaves and older states.
     """
 
     def __init__(self, solver: gtsam.ISAM2, staged: gtsam.Values) -> None:
@@ -53,11 +54,11 @@ class LazyEstimates:
         self._whole: gtsam.Values | None = None
 
     def exists(self, key: int) -> bool:
-        """Whether a key is in the window, or staged."""
+        """Return whether a key is in the window, or staged."""
         return bool(self._solver.valueExists(key) or self._staged.exists(key))
 
     def atPose3(self, key: int) -> Any:
-        """Return a pose, by the name that it has in `gtsam.Values`; so do the others."""
+        """Return a pose. This and the next methods have the names of those of `gtsam.Values`."""
         known = self._solver.valueExists(key)
         return self._solver.calculateEstimatePose3(key) if known else self._staged.atPose3(key)
 
@@ -72,7 +73,7 @@ class LazyEstimates:
         return self._solver.calculateEstimateConstantBias(key) if known else self._staged.atConstantBias(key)
 
     def whole(self) -> gtsam.Values:
-        """Return the values of all keys of the last commit."""
+        """Return the estimates of all keys of the last commit."""
         if self._whole is None:
             self._whole = self._solver.calculateEstimate()
         return self._whole
@@ -80,7 +81,7 @@ class LazyEstimates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mark:
-    """A copy of all that a commit changes, to restore a window with nothing staged."""
+    """A copy of all that a commit changes, to restore a window; nothing was staged when it was made."""
 
     solver: gtsam.ISAM2
     linearised: gtsam.Values
@@ -89,14 +90,21 @@ class Mark:
 
 
 class Window:
-    """A fixed-lag smoother. `values` tells the estimate of every key in it, and the guess of staged keys."""
+    """A fixed-lag smoother.
+
+    Args:
+        lag_s: time after which a key that was not touched is marginalised.
+
+    Attributes:
+        lag_s: as given. values: estimate of every key in it, and the guess of staged keys.
+    """
 
     def __init__(self, lag_s: float) -> None:
         params = gtsam.ISAM2Params()
         params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
         params.setFactorization("QR")  # Cholesky gives up on slow biases
         params.findUnusedFactorSlots = True  # else slots grow without end
-        params.relinearizeSkip = _NEVER  # but see `relinearise`
+        params.relinearizeSkip = _NEVER  # not by itself: see `relinearise`
         params.setRelinearizeThreshold(_RELINEARIZE)
         self.lag_s = lag_s
         self._solver = gtsam.ISAM2(params)
@@ -115,7 +123,7 @@ class Window:
         self._to_relinearise = False
 
     def guess(self, key: int, value: Any, t_s: float) -> None:
-        """Stage a new key."""
+        """Stage a new key, with the value to solve it from."""
         self._guess.insert(key, value)
         self._linearised.insert_or_assign(key, value)
         self._stamps[key] = t_s
@@ -132,7 +140,7 @@ class Window:
         """Stage factors.
 
         Raises:
-            SolveError: a key of one of them is not in the window (any more).
+            SolveError: a key of a factor is not in the window, or has left it.
         """
         found = list(factors)
         keys = frozenset(key for factor in found for key in keys_of(factor))
@@ -159,7 +167,7 @@ class Window:
         return self._linearised.atPose3(key)
 
     def relinearise(self) -> bool:
-        """Relinearise in the next commit the keys that have moved; `linearised_at` gives their new points at once.
+        """Have the next commit relinearise the keys that have moved; `linearised_at` gives their new points at once.
 
         Returns:
             Whether any key has moved.
@@ -187,7 +195,7 @@ class Window:
         params = gtsam.ISAM2UpdateParams()
         params.removeFactorIndices = self._remove
         params.force_relinearize = self._to_relinearise
-        if gone or self._to_relinearise or self._remove:  # else little is eliminated again
+        if gone or self._to_relinearise or self._remove:  # else little is eliminated again, and needs no order
             params.constrainedKeys = _groups(alive, gone, self._newest)
         if gone:  # marginalised keys must be leaves of the tree
             params.extraReelimKeys = _listed(self._alive.keys() & alive)
@@ -206,7 +214,7 @@ class Window:
         self._clear()
 
     def settle(self, steps: int = 1) -> None:
-        """Apply what is staged, if anything is, and relinearise up to `steps` times."""
+        """Apply what is staged, if anything is; then relinearise and solve up to `steps` times, while keys move."""
         if self._added or self._remove:
             self.commit()
         for _ in range(steps):
@@ -237,7 +245,7 @@ class Window:
         """Restore a mark, also after an exception; each mark can be used once.
 
         Args:
-            held: factors that may have been removed since, and their slots then.
+            held: factors that may have been removed since the mark, and the slots that they had then.
         """
         self._solver, self._linearised = mark.solver, mark.linearised
         self._alive, self._newest = mark.alive, mark.newest
@@ -250,10 +258,12 @@ class Window:
         return [key for key in keys if self.values.exists(key) and self.stamp_of(key) < now_s - self.lag_s]
 
     def covariance(self, keys: Sequence[int]) -> Array:
-        """Return the joint covariance of committed keys, in their order, poses first; of a pose in the body tangent at its estimate.
+        """Return the joint covariance of committed keys, in their order; poses must come first.
+
+        That of a pose is in the body tangent at its estimate.
 
         Raises:
-            SolveError: it could not be computed.
+            SolveError: the covariance could not be computed.
         """
         try:
             if len(keys) == 1:
@@ -262,7 +272,7 @@ class Window:
                 cov = np.asarray(self._solver.jointMarginalCovariance(list(keys)).fullMatrix())
         except (RuntimeError, IndexError, ValueError) as error:
             raise not_solved("the covariance could not be computed", error) from error
-        # The solver's tangents are at its linearisation points; turn those of the poses to the estimate.
+        # The solver's tangents are at its linearisation points; turn the tangents of poses to the estimate.
         for n, key in enumerate(itertools.takewhile(is_pose, keys)):
             turn = self.values.atPose3(key).rotation().matrix().T @ self.linearised_at(key).rotation().matrix()
             for rows in (slice(6 * n, 6 * n + 3), slice(6 * n + 3, 6 * n + 6)):
@@ -271,22 +281,22 @@ class Window:
         return cov
 
     def error(self, without: Iterable[Held] = ()) -> float:
-        """Return the cost of the graph at the estimate (half the weighted squares), without that of some factors."""
+        """Return the cost of the graph at the estimate (half the weighted squares), not counting factors `without`."""
         graph = self._solver.getFactorsUnsafe()
         return float(graph.error(self.values.whole())) - self._bent(graph) - sum(self.errors_of(without))
 
     def _bent(self, graph: gtsam.NonlinearFactorGraph) -> float:
-        """Return how much the factors at the oldest poses cost beyond their cost in the solver, which cannot relinearise these poses.
+        """Return how much more the factors at the oldest poses cost than in the solver, which keeps these poses fixed.
 
-        Half a metre from the linearisation point the IMU factor there costs tens: every change that moves the oldest end of
-        the window would be rejected for that alone.
+        Half a metre from the linearisation point, the IMU factor there costs tens more. Every change that moves the
+        oldest end of the window would be rejected for that alone.
         """
         solver = self._solver
         held, slots = solver.getFixedVariables(), solver.getVariableIndex()
         oldest = [key for key in self._alive if is_pose(key) and held.count(key)]
         point, step = solver.getLinearizationPoint(), solver.getDelta()
         steps = [graph.at(slot) for slot in {slot for key in oldest for slot in slots.at(key)}]
-        # A linear factor costs the same either way; a robust one is another loss where it is linear.
+        # A linear factor costs the same in both; a robust one is left out, as linearised it has another loss.
         bent = [
             f
             for f in steps
@@ -296,12 +306,12 @@ class Window:
         return float(sum(f.error(values) - f.linearize(point).error(step) for f in bent))
 
     def errors_of(self, parts: Iterable[Held]) -> list[float]:
-        """Return the cost of committed factors, of each `Held` together."""
+        """Return the cost of committed factors, summed for each `Held`."""
         factors, values = self._solver.getFactorsUnsafe(), self.values.whole()
         return [float(sum(factors.at(slot).error(values) for slot in held.slots)) for held in parts]
 
     def linear(self, first: Iterable[Held]) -> tuple[Any, Array]:
-        """Return J (rows, columns) and b (rows,) of all factors in whitened rows, linearised at the estimate; those of `first` come first."""
+        """Return J (rows, columns) and b (rows,) of all factors at the estimate, whitened; rows of `first` lead."""
         factors = self._solver.getFactorsUnsafe()
         begin = [slot for held in first for slot in held.slots]
         rest = set(range(factors.size())).difference(begin)
@@ -316,7 +326,7 @@ class Window:
 
     @property
     def factor_slots(self) -> int:
-        """Number of slots that iSAM2 keeps for factors: must not grow with time."""
+        """Number of slots that iSAM2 keeps for factors; it must not grow with time."""
         return int(self._solver.getFactorsUnsafe().size())
 
 
@@ -328,15 +338,15 @@ def _listed(keys: Iterable[int]) -> Any:
 
 
 def _groups(alive: Iterable[int], gone: Collection[int], newest: Collection[int]) -> Any:
-    """Return the groups of the elimination order: keys that are marginalised, those that stay, and the newest.
+    """Return the groups of the elimination order: keys that are marginalised, keys that stay, and the newest keys.
 
-    CCOLAMD fails where the number of a group is not below the number of keys: so where nothing is marginalised there are only
-    two groups, or one.
+    CCOLAMD fails where the number of a group is not below the number of keys. So where nothing is marginalised, groups
+    are numbered without a first one for that.
     """
     stays = 1 if gone else 0
     groups = gtsam.KeyGroupMap()
     for key in gone:
         groups.insert2(key, 0)
-    for key in alive:  # insert2 keeps the group of a key that has one
+    for key in alive:  # a key that has a group keeps it
         groups.insert2(key, stays + 1 if key in newest else stays)
     return groups
