@@ -34,7 +34,8 @@ class TimelineConfig(Block):
     """The states of the graph."""
 
     rate_hz: Annotated[float, Field(gt=0.5, le=200.0)] = 10.0
-    """States per second; a state is moved onto the stamp of a measurement close by."""
+    """States per second; a state is moved onto the stamp of a measurement close by. With fewer than 2.5 a vessel goes decimetres from a
+    state to a measurement, a way that is taken as estimated: too coarse for RTK and tags."""
     slow_period_s: Annotated[float, Field(ge=0.05, le=60.0)] = 1.0
     """Time between two states of slow quantities (IMU bias, GNSS error), s. Online from some 2 s on fixes are believed much less,
     as their slow error walks unseen in between."""
