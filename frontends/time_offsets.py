@@ -316,7 +316,7 @@ def _sums(along: Array, felt: Array, swung: Array, begun: NDArray[np.int64]) -> 
 
 
 def _explained(spread: Array, held: float) -> Array:
-    """Return the multiple correlation (L,) of an acceleration with what is felt and a swing; 0 if it opposes what is felt.
+    """Return the multiple correlation (L,) of an acceleration with what is felt and a swing; 0 if it opposes the felt.
 
     Args:
         spread: (L, 3, 3) sums of products of acceleration, felt and swing about their means; (L, 2, 2) without the
