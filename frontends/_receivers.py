@@ -69,7 +69,7 @@ def receiver_of(topic: str) -> str:
 
 
 def _octave(gnss: GnssReport, wanders_m: float | None, level_m: float, *, claimed: bool) -> int:
-    """Return the size of the fixes' error, by claim, scatter or drift, as the rounded log2 of metres: for a coarse order.
+    """Return the size of the fixes' error, by claim, scatter or drift, as the rounded log2 of metres.
 
     Args:
         gnss: the receiver. wanders_m: by how much its height wanders, 1 sigma; None if it tells no height.
@@ -110,7 +110,7 @@ def timed_fixes(
     velocities: Sequence[tuple[TopicData, VelocityReport]],
     streams: Mapping[str, TopicData],
 ) -> GnssReport:
-    """Return the report with how late the fixes' stamps are, by the fixes or a velocity over ground that tells it better.
+    """Return the report with how late the fixes' stamps are, by the fixes or a velocity that tells it better.
 
     A receiver measures fixes and velocity at once. A velocity with another latency is taken for another device's.
     Plotters average course and speed over seconds, but not the position: a velocity that shows the motion later than
