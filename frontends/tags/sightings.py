@@ -155,7 +155,7 @@ def is_rectified(topic: str) -> bool:
 
 
 def _lens(bag: Bag, name: str, config: CameraConfig, listed: bool, warn: Callable[[str], None]) -> CameraModel | None:
-    """Return the camera's calibration, by the first CameraInfo in the whole bag; None of a list without `info_topic`."""
+    """Return the camera's calibration by the first CameraInfo in the whole bag; None of a list without `info_topic`."""
     topic = config.info_topic
     if not topic and listed:
         return None
