@@ -110,18 +110,18 @@ class MessageTypes:
         for store in others:
             try:
                 msg = self._with(store, data, msgtype)
-            except Exception:  # noqa: BLE001, S112 - a version that it is not may raise nearly anything
+            except Exception:  # noqa: BLE001, S112 - a wrong version may raise nearly anything
                 continue
             self._stores[msgtype] = [store]
             return msg
         return self._with(last, data, msgtype)
 
     def _with(self, store: Typestore, data: bytes, msgtype: str) -> object:
-        store.max_sequence_length = len(data) or 1  # of what takes no bytes there could be 2^32
+        store.max_sequence_length = len(data) or 1  # a damaged length may state 2^32 elements that take no bytes
         return (store.deserialize_ros1 if self._ros1 else store.deserialize_cdr)(data, msgtype)
 
     def _stores_of(self, msgtype: str) -> list[Typestore]:
-        """Return stores with the definition of a type in the bag; without one, the standard one, or all of a maker's."""
+        """Return stores with the definition of a type in the bag; else with the standard one, or all of a maker's."""
         definitions = (c.msgdef for c in self._connections if c.msgtype == msgtype)
         for definition in definitions:
             if definition.format == MessageDefinitionFormat.NONE:
