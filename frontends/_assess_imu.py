@@ -43,8 +43,8 @@ _LEFT_OF_TURNS = 0.5  # largest share of a course's changes that turning about t
 # Angle between gravity, by the mount in tf, and body z, from which the IMU is upside down. No mount is off by 30 deg
 # unnoticed, but one may be by 180; a choice.
 _UPSIDE_DOWN_DEG = 150.0
-# Least number of quiet seconds in a row at standstill; a craft that only changes between ahead and astern is slow for
-# less than the other.
+# Least number of quiet seconds in a row at standstill; a craft that only changes between ahead and astern is slow for a
+# shorter time than the second.
 _QUIET_S, _STANDS_S = 2, 1.5
 # Angle between gravity and body z from which a note says so; how near 90 deg gravity or the motion must be off to
 # overrule tf; and the coherence that this takes of the motion.

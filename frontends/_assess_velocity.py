@@ -46,7 +46,7 @@ _OF_GNSS = re.compile(r"gps|gnss|fix|ublox|novatel|septentrio|antenna|enu", re.I
 _OF_LOG = re.compile(r"dvl|doppler|wheel|speed_?log", re.IGNORECASE)
 _FEWEST = 20  # least number of velocities or fixes, two to twenty seconds: of fewer, axes are chance; a choice
 _FAR_WORSE = 5.0  # fixes that claim over so many times the median sigma are left out
-_ASTERN, _MOVES_MPS = 0.95, 0.3  # share of speeds astern, of those that are larger, from which a sign looks wrong
+_ASTERN, _MOVES_MPS = 0.95, 0.3  # if so large a share of the larger speeds is astern, the sign looks wrong
 _ALONG = 0.9  # cosine between x of a log and of the body: if it is less, the log's y tells speed ahead, too
 _REVERSED = "it goes astern nearly all the time: its sign looks wrong, and is taken for reversed"
 
