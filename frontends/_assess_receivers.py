@@ -51,8 +51,8 @@ def apart(first: GnssReport, second: GnssReport, fixes: TopicData, others: Topic
         first, second: reports of the two receivers. fixes, others: their streams.
 
     Returns:
-        None if too few fixes overlap. The distance is 0 where the antennas keep none, or where it is too long for a
-        craft.
+        None if too few fixes overlap. The distance is 0 where the antennas keep none, where it is too long for a
+        craft, or where the line between them does not turn with the craft.
     """
     at, rows = _moving(fixes)
     there, other_rows = _moving(others)
