@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Judging sensors by each other: how a topic arrives, how good the GNSS is, how the craft moved.
 
-Everything here is a guess with its evidence in words; `draft_config` writes both down.
+Every result is a guess with its evidence in words; `draft_config` writes down the guess and the evidence.
 """
 
 from __future__ import annotations
@@ -27,17 +27,22 @@ from graphloc.signals.white_noise import white_noise
 from graphloc.time import NS_PER_S, stamps_of
 
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
-_EITHER = 0.01  # share of the fixes, at least, of RTK and of others, where it comes and goes
+_EITHER = 0.01  # least share of RTK fixes, and of others, of a receiver that has RTK by turns
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredMotion:
-    """How the craft moved: times (N,) s since `origin_ns`, speed (N,) m/s (signed where the source knows).
+    """How the craft moved, by one source.
 
-    `way_m`: (N,) its places, m, east + i north, about any origin; None where the source tells the speed only. `attitude`: N rotations to
-    the world from the craft's axes, where the source tells them, too.
-    `rests`: whether its speed is precise enough to tell that the craft stands.
+    Attributes:
+        source: topic or sensor that tells it.
+        origin_ns, t_s: a stamp; (N,) times since then, s.
+        speed_mps: (N,) speed, m/s; negative astern, where the source knows.
+        way_m: (N,) positions, m, east + i north, about any origin, or of wheels in axes of their own; None where the
+            source tells the speed only.
+        rests: whether the speed is precise enough to tell that the craft stands.
+        attitude: N rotations R_world_body; None where the source tells none.
     """
 
     source: str
@@ -51,7 +56,7 @@ class MeasuredMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Courses:
-    """Course over ground (rad, from east, counter-clockwise) at some stamps, from chords of the GNSS track."""
+    """Courses over ground (N,), rad from east, counter-clockwise, at stamps (N,), ns, from chords of the GNSS track."""
 
     stamps_ns: NDArray[np.int64]
     course_rad: Array
@@ -59,9 +64,12 @@ class Courses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceTrack:
-    """Where the craft was, by its best receiver: stamps (N,), places (N, 3), m, east, north, up.
+    """Where the craft was, by its best receiver or by poses in a map grid.
 
-    `scatter_m`: their noise, 1 sigma of an axis. `first`: latitude, longitude (deg) and height (m) that they are about; None of poses in a map grid.
+    Attributes:
+        stamps_ns, p_m: (N,) stamps; (N, 3) positions, m, east, north, up.
+        scatter_m: white noise of the positions, 1 sigma of an axis.
+        first: latitude, longitude (deg) and height (m) of their origin; None of poses in a map grid.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -86,7 +94,8 @@ def topic_report(stream: TopicData, count: int) -> TopicReport:
     if len(stamps) == 0:
         return TopicReport(**base, undecodable=stream.undecodable, broken=stream.broken, no_stamp=stream.no_stamp)  # type: ignore[arg-type]
     steps = np.diff(stamps)
-    # Messages that come out of order leave no gap, and the rate is not that of those in order.
+    # Messages out of order leave no gap, and count in the rate: so steps of the sorted stamps. A clock that was set
+    # back would interleave two parts.
     ahead = np.diff(stamps if _clock.set_backs(stamps) else np.sort(stamps))
     ahead = ahead[ahead > 0] / NS_PER_S
     usual = float(np.median(ahead)) if len(ahead) else None
@@ -111,7 +120,11 @@ def topic_report(stream: TopicData, count: int) -> TopicReport:
 
 
 def sane(stream: TopicData, finite: slice | None = None) -> NDArray[np.intp]:
-    """Return indices of messages in order of strictly increasing stamps, without clock jumps, and with some columns `finite`."""
+    """Return indices of messages with strictly increasing stamps, without clock jumps.
+
+    Args:
+        finite: columns of `rows` that must be finite; None: none.
+    """
     good = np.flatnonzero(~_clock.clock_jumps(stream.stamps_ns, stream.logs_ns))
     keep = good[_clock.longest_increasing(stream.stamps_ns[good])]
     if finite is None or not len(keep):
@@ -120,9 +133,10 @@ def sane(stream: TopicData, finite: slice | None = None) -> NDArray[np.intp]:
 
 
 def without_drift(streams: Sequence[TopicData]) -> list[TopicData]:
-    """Return streams whose clocks do not drift against each other, by the recording times: the steadiest clock is believed.
+    """Return the streams with the drift of their clocks taken off the stamps.
 
-    Clocks that gain as much as that one are left as they are: then it is the recorder's that drifts.
+    Drifts are those against the recording times, less that of the steadiest clock, which is believed: what this clock
+    gains is the drift of the recorder's. So clocks that gain as much stay as they are.
     """
     ppm = {s.topic: 0.0 if s.recorded else _clock.gain(s.stamps_ns, s.logs_ns).drift_ppm for s in streams}
     told = [s for s in streams if len(s) >= _clock.FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED]
@@ -138,16 +152,18 @@ def without_drift(streams: Sequence[TopicData]) -> list[TopicData]:
 
 
 def evenly(imu: TopicData) -> TopicData:
-    """Return an IMU's stream, samples that were stamped in bursts laid out evenly."""
+    """Return an IMU's stream, with samples that were stamped in bursts laid out evenly."""
     return imu.stamped(_clock.evened(imu.stamps_ns, imu.rows[:, :6]))
 
 
 def on_one_clock(streams: Sequence[TopicData]) -> list[TopicData]:
-    """Return streams with messages, each on the clock of the first IMU where its own is another one, by the recording times.
+    """Return the streams on one clock: that of the first IMU or, if it tells no date, the first clock that does.
 
-    Where that tells no date, on the first clock that does.
+    Streams that lie seconds or years apart cannot be judged by each other. By how much a clock differs is told by the
+    recording times; below a limit its stamps stay. The limit of places is wider: a pose takes time to match.
 
-    One cannot be judged by another that lies seconds or years away. A pose may well come late: it takes time to match.
+    Args:
+        streams: with one message each at least.
     """
     clocks = {
         s.topic: _clock.Clock(int(s.stamps_ns.min()), _clock.usual_latency_s(s.stamps_ns, s.logs_ns)) for s in streams
@@ -166,9 +182,10 @@ def on_one_clock(streams: Sequence[TopicData]) -> list[TopicData]:
 
 
 def track(fixes: TopicData) -> tuple[NDArray[np.int64], Array, Array]:
-    """Return stamps (N,), positions (N, 3) m about the first good fix, and the good fixes' rows (not those of a stored position).
+    """Return the stamps (N,) of good fixes, their positions (N, 3), m, about the first one, and their rows.
 
-    Fixes without a height lie as high as most of the others, or at 0.
+    Left out are fixes of a stored position, and fixes far from all others. A fix without a height has the median height
+    of the others, or 0 if none has one.
     """
     keep, rows = _placed(fixes)
     there = ~stored(fixes.stamps_ns[keep], rows[:, :3])
@@ -182,7 +199,7 @@ def track(fixes: TopicData) -> tuple[NDArray[np.int64], Array, Array]:
 
 
 def _placed(fixes: TopicData) -> tuple[NDArray[np.intp], Array]:
-    """Return indices and rows of the fixes that state a place, each with a height."""
+    """Return indices and rows of the fixes that state a place; missing heights are filled in, see `track`."""
     keep = sane(fixes)
     rows = fixes.rows[keep] if len(keep) else np.zeros((0, 8))
     good = (
@@ -196,7 +213,7 @@ def _placed(fixes: TopicData) -> tuple[NDArray[np.intp], Array]:
 
 
 def courses_of(way: ReferenceTrack) -> Courses:
-    """Return the direction of chords of the track long enough that its noise does not turn them."""
+    """Return the directions of chords of the track that are so long that its noise hardly turns them."""
     stamps_ns, p_m = way.stamps_ns, way.p_m
     reach = max(3.0, 8.0 * way.scatter_m)
     at, course = [], []
@@ -215,7 +232,7 @@ def courses_of(way: ReferenceTrack) -> Courses:
 
 
 def courses_of_fixes(fixes: Sequence[GnssPosition]) -> Courses:
-    """Return the courses of one receiver's fixes, in any order; none of fewer than twenty."""
+    """Return the courses of one receiver's fixes, given in any order; empty of fewer than twenty fixes."""
     fixes = sorted(fixes, key=lambda m: m.stamp_ns)
     if len(fixes) < 20:
         return Courses(np.zeros(0, dtype=np.int64), np.zeros(0))
@@ -224,7 +241,7 @@ def courses_of_fixes(fixes: Sequence[GnssPosition]) -> Courses:
 
 
 def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> MeasuredMotion | None:
-    """Return the motion of one receiver's fixes, in any order; None of fewer than twenty."""
+    """Return the motion of one receiver's fixes, given in any order; None of fewer than twenty fixes."""
     if len(fixes) < 20:
         return None
     moments = {m.stamp_ns: m for m in fixes}
@@ -234,7 +251,10 @@ def motion_of_fixes(source: str, fixes: Sequence[GnssPosition]) -> MeasuredMotio
 
 
 def motion_of_places(source: str, stamps_ns: NDArray[np.int64], p_m: Array) -> MeasuredMotion | None:
-    """Return the motion that places (N, 3), m, tell: of a slow craft, their noise hides whether it stands; None of few."""
+    """Return the motion that positions (N, 3), m, tell; None of fewer than twenty.
+
+    Of a slow craft the noise of the positions hides whether it stands (`rests`).
+    """
     t = (stamps_ns - stamps_ns[0]) / NS_PER_S if len(stamps_ns) else np.zeros(0)
     step = max(1, round(_WINDOW_S / float(np.median(np.diff(t))))) if len(t) > 1 else 1
     if len(t) < max(20, step + 2):
@@ -253,17 +273,20 @@ def _by_turns(
     sigmas_m: Array,
     fixed: NDArray[np.bool_],
 ) -> tuple[PartOfFixes, PartOfFixes] | None:
-    """Return the fixes (N,) of RTK, and the others, where a receiver has both.
+    """Return summaries of the RTK fixes and of the others; None where nearly all fixes are of one of these kinds.
 
     Args:
-        rows: (N, 8) of each. known: whether it states its noise. sigmas_m: which, horizontally. fixed: whether it is of RTK.
+        stamps_ns, p_m, rows: (N,), (N, 3) m and (N, 8) of the fixes.
+        known: (N,) whether a fix states its noise. sigmas_m: (N,) its horizontal sigma, stated or by default.
+        fixed: (N,) whether a fix is of RTK.
     """
     if not _EITHER <= fixed.mean() <= 1.0 - _EITHER:
         return None
 
     def part(of: NDArray[np.bool_]) -> PartOfFixes:
         told = of & known
-        # A float's error is as large as it claims; what is no RTK at all claims more for its white noise, or too little.
+        # The slow error of an RTK float is as large as its claimed sigma. Without RTK, claims are of the white noise,
+        # or too small, so the default is taken.
         default_m = SlowErrorConfig().horizontal_sigma_m
         slow_m = np.where(rows[of, 3] >= 2.0, np.minimum(sigmas_m[of], default_m), default_m)
         return PartOfFixes(
@@ -277,7 +300,7 @@ def _by_turns(
 
 
 def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
-    """Return status, spread and a guess on slow errors; None where there is no fix at all."""
+    """Return status, spread and a guess on slow errors of a receiver's fixes; None where there is no good fix."""
     stamps, p, rows = track(fixes)
     if len(stamps) == 0:
         return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Assess a compass: whether an orientation is a heading, in which convention, and how far off the course."""
+"""Assess a compass: whether an orientation is a heading, in which convention, and its offset from the course."""
 
 from __future__ import annotations
 
@@ -20,22 +20,24 @@ from graphloc.signals.series import robust_sigma
 from graphloc.time import NS_PER_S
 
 _FEWEST, _FEWEST_COURSES = 10, 20
-_TURNS_DEG, _SAME_DEG = 5.0, 0.2  # how much two headings must turn, and may differ by, to be one
-_DELAYS_S = np.arange(-50, 51) / 100.0  # of one heading against another that is the same
-_MOST_COMPARED = 5000  # headings of a long run
-_GAP_S, _GAP = 2.0, 3.0  # between two headings, at least, and times what is usual: none came meanwhile
+_TURNS_DEG, _SAME_DEG = 5.0, 0.2  # two topics are one heading if it turns by more than this, and they differ by less
+_DELAYS_S = np.arange(-50, 51) / 100.0  # delays that are tried between two topics of one heading
+_MOST_COMPARED = 5000  # most headings of a run that are compared
+_GAP_S, _GAP = 2.0, 3.0  # a gap in headings is longer than this, and than so many times the median interval
 _STRAIGHT_DEG = 20.0  # courses that turn by less tell no convention
-_ASKEW_DEG = 15.0  # antennas are mounted along a vessel or athwart, to this
-_BLOCK_S = 30  # of which the middle is taken: waves and short turns average out, and a minute and a half tells a wander; a choice
-_SCATTERS_DEG = 15.0  # of a heading about the course, from which the course is no test of it
-_SIDEWAYS_DEG = 45.0  # to which scatter courses still tell by which quarter turn two antennas are mounted
-# Of a vessel that goes ahead and astern: least share of the courses either way; how often it turns back; share of the way it goes mostly.
+_ASKEW_DEG = 15.0  # two antennas lie along the vessel or athwart, within this
+# Blocks whose median is taken: waves and short turns average out, and a minute and a half tells a wander; a choice.
+_BLOCK_S = 30
+_SCATTERS_DEG = 15.0  # scatter of a heading about the course, from which the course is no test of it
+_SIDEWAYS_DEG = 45.0  # scatter up to which courses still tell by which quarter turn two antennas are mounted
+# Of a vessel that goes ahead and astern: least share of the courses either way; largest share of courses at which it
+# changes between them; share from which the way that it mostly goes is ahead, even if the heading says astern.
 _EITHER_WAY, _OFTEN, _MOST = 0.15, 0.1, 0.6
-_RELATIVE_DEG = 30.0  # off the course, from which an IMU's orientation has a north of its own
+_RELATIVE_DEG = 30.0  # offset from the course, from which the orientation of an IMU has a north of its own
 
 
 class _Conventions(NamedTuple):
-    """What tells the convention of a heading: its type, the gyroscope, and what the maker's driver comes with; None where it does not."""
+    """Conventions of a heading: by its type, by the gyroscope, and by default of a maker's driver; None if not told."""
 
     told: str | None
     by_gyro: str | None
@@ -43,7 +45,12 @@ class _Conventions(NamedTuple):
 
 
 def compass_report(stream: TopicData, courses: Courses | None, turning: Turning | None) -> CompassReport | None:
-    """Return whether an orientation is a heading, and in which convention; None where there is none."""
+    """Return whether an orientation is a heading, and in which convention; None where there is no orientation.
+
+    Args:
+        stream: an orientation, IMU or bare number. courses: of the fixes; None without fixes.
+        turning: the integrated gyroscope; None without an IMU.
+    """
     keep = sane(stream)
     if len(keep) < _FEWEST or _left_out(stream, stream.rows[keep]):
         return None
@@ -78,7 +85,10 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
 
 
 def _without_courses(report: CompassReport, known: _Conventions, heard: Courses | None) -> CompassReport:
-    """Return the report of a heading at whose times there are no courses, or few: a topic of bare orientations is meant as a compass."""
+    """Return the report of a heading at whose times there are no courses, or too few.
+
+    Only a topic of bare orientations is usable without courses: it is meant as a compass.
+    """
     why = "no GNSS course in motion to check it against"
     if heard is not None and not len(heard.stamps_ns) and report.msgtype in NUMBERS:
         why = "no GNSS course in motion at the times it was recorded (it has no stamp)"
@@ -91,15 +101,17 @@ def _without_courses(report: CompassReport, known: _Conventions, heard: Courses 
 def _by_courses(
     report: CompassReport, known: _Conventions, fit: _Fit, courses: Courses, *, follows: bool
 ) -> CompassReport:
-    """Return the report of a heading beside the courses of the fixes.
+    """Return the report of a heading that was compared with the courses of the fixes.
 
-    Courses tell headings of a vessel that goes ahead; of one that is set sideways only the gyroscope tells whether it is one. But
-    an IMU's own orientation follows the gyroscope wherever north is. Two antennas know north, and an Imu of an orientation alone is
-    taken for such; athwart, they are a quarter turn off. Another heading that is a quarter turn off courses to either side is of a vessel that
-    swings, as at anchor, rather than of one mounted athwart that goes ahead and astern.
+    Courses confirm the heading of a vessel that goes ahead. Where a vessel is set sideways, only the gyroscope can
+    confirm it, though not that of an IMU: its orientation follows the gyroscope wherever its north is. Two antennas
+    know north; an Imu message with an orientation alone is taken for two antennas. Mounted athwart, they are a quarter
+    turn off. Another heading that is a quarter turn off the courses, to either side, is of a vessel that swings, as at
+    anchor, rather than of a compass mounted athwart on a vessel that goes ahead and astern.
 
     Args:
-        follows: whether it turns as the gyroscope does, though not with the courses.
+        report: as it is without courses. known: its conventions. fit, courses: of `_beside_courses`.
+        follows: whether the heading turns as the gyroscope does, though not as the courses do.
     """
     quarter = report.two_antennas and fit.scatter_deg < _SIDEWAYS_DEG and abs(abs(fit.offset_deg) - 90.0) < _ASKEW_DEG
     knows_north = report.msgtype != IMU or abs(fit.offset_deg) < _RELATIVE_DEG or quarter
@@ -113,28 +125,31 @@ def _by_courses(
         samples=len(fit.apart_rad),
         why=_why(fit, known, sideways=sideways),
     )
-    if sideways and not quarter:  # no course tells how it is mounted
+    if sideways and not quarter:  # no course tells how the compass is mounted
         return report
     leeway_deg = _wanders_deg(courses.stamps_ns, _ahead(fit.apart_rad, np.radians(fit.offset_deg)))
     return replace(report, offset_deg=fit.offset_deg, leeway_deg=leeway_deg)
 
 
 def _of_two_antennas(stream: TopicData, rows: Array) -> bool:
-    """Return whether a heading is one of GNSS. Drivers of receivers with two antennas fill an Imu with the orientation alone."""
+    """Return whether a heading is from two GNSS antennas.
+
+    Drivers of such receivers send an Imu message with the orientation alone.
+    """
     if stream.part is not None:
         return stream.part.antennas
     return not rows[:, :6].any() if stream.msgtype == IMU else two_antennas(stream.topic)
 
 
 def _left_out(stream: TopicData, rows: Array) -> bool:
-    """Return whether an Imu says that it has no orientation, or always the same one."""
+    """Return whether an IMU says that it has no orientation, or has the same one always."""
     if stream.msgtype != IMU:
         return False
     return float(np.median(rows[:, 12])) == -1.0 or len(np.unique(_quaternions(stream, rows), axis=0)) < 3
 
 
 def _heard(courses: Courses | None, stamps_ns: NDArray[np.int64]) -> Courses | None:
-    """Return the courses at whose times headings, at stamps (N,), came: not before, after or in a gap of them."""
+    """Return the courses at whose times there are headings, at stamps (N,), rather than a gap; None without courses."""
     if courses is None:
         return None
     after = np.searchsorted(stamps_ns, courses.stamps_ns)
@@ -145,7 +160,7 @@ def _heard(courses: Courses | None, stamps_ns: NDArray[np.int64]) -> Courses | N
 
 
 def in_enu(angle: Array, convention: str) -> Array:
-    """Return headings (N,), rad, as yaw from east, counter-clockwise."""
+    """Return headings (N,), rad, in a convention ('enu' or 'ned') as yaw from east, counter-clockwise."""
     return angle if convention == "enu" else np.pi / 2.0 - angle
 
 
@@ -153,8 +168,10 @@ class _Fit(NamedTuple):
     """A heading beside the courses of the fixes.
 
     Attributes:
-        offset_deg, scatter_deg: heading minus course: its middle, and 1 sigma about it. apart_rad: (M,) the same, of each course.
-        astern: share of the courses on which the vessel goes astern, where it goes either way; else 0.
+        convention: the one in which the heading was compared.
+        offset_deg, scatter_deg: median of heading minus course, and 1 sigma about it.
+        astern: share of the courses on which the vessel goes astern, where it goes ahead and astern; else 0.
+        apart_rad: (M,) heading minus course, at each course.
         straight: whether the courses turn too little to tell the convention.
     """
 
@@ -167,7 +184,7 @@ class _Fit(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """Whether it is a heading by that."""
+        """Whether the courses confirm the heading."""
         return self.scatter_deg < _SCATTERS_DEG
 
 
@@ -175,7 +192,7 @@ def _beside_courses(stamps_ns: NDArray[np.int64], angle: Array, courses: Courses
     """Return how a heading fits the courses, in the convention that its type or the gyroscope tells, or that fits best.
 
     Args:
-        stamps_ns, angle: (N,) ns; (N,) rad, unwrapped.
+        stamps_ns, angle: (N,) stamps; (N,) headings as the messages say them, rad, unwrapped.
     """
     origin = stamps_ns[0]
     measured = np.interp((courses.stamps_ns - origin) / NS_PER_S, (stamps_ns - origin) / NS_PER_S, angle)
@@ -188,7 +205,8 @@ def _beside_courses(stamps_ns: NDArray[np.int64], angle: Array, courses: Courses
         offset_deg, scatter_deg, _ = fits[convention]
         if not straight:
             return (scatter_deg,)
-        # On a straight both conventions fit with some offset: the smaller offset is likelier, of two antennas one of quarter turns.
+        # On a straight track both conventions fit with some offset. The smaller one is likelier; of a driver that has a
+        # usual convention, one near a multiple of 90 deg, then the smaller multiple, then the usual convention.
         if known.usual is None:
             return (abs(offset_deg),)
         askew = abs((offset_deg + 45.0) % 90.0 - 45.0) > _ASKEW_DEG
@@ -199,14 +217,20 @@ def _beside_courses(stamps_ns: NDArray[np.int64], angle: Array, courses: Courses
 
 
 def _beside_either_way(apart: Array) -> tuple[float, float, float]:
-    """Return by how much a heading is off courses (N,), rad: middle and 1 sigma, deg, and on what share of them the vessel goes astern.
+    """Return the median of heading minus course, its scatter (1 sigma), and the share of courses that go astern.
 
-    One that goes ahead and astern, for a while each, has two middles, half a turn apart: that of most courses is how the heading is
-    mounted, or, where neither is, that nearer to the bow.
+    A vessel that goes ahead and astern, for a while each, has two medians, half a turn apart. The one of clearly more
+    courses is the offset of the heading; if neither has clearly more, the one nearer to 0.
+
+    Args:
+        apart: (N,) heading minus course, rad.
+
+    Returns:
+        Median and scatter, deg; the share, 0 where the vessel goes one way.
     """
     offset_deg, scatter_deg = _middle_deg(apart)
     twice_deg, twice_scatter_deg = _middle_deg(2.0 * apart)
-    bow_deg = 0.5 * twice_deg  # within 90 deg of it
+    bow_deg = 0.5 * twice_deg  # that of the two medians within 90 deg of 0
     over = np.abs(wrap_angle(apart - np.radians(bow_deg))) > np.pi / 2.0
     share = float(over.mean())
     leaps = float((over[1:] != over[:-1]).mean()) if len(over) > 1 else 0.0
@@ -233,11 +257,11 @@ def _why(fit: _Fit, known: _Conventions, *, sideways: bool) -> str:
 
 
 def unit_of(stream: TopicData) -> str | None:
-    """Return the unit of a stream of bare numbers, if they are headings; None where it is none."""
+    """Return the likely unit of a stream of bare numbers that are headings; None of another type of stream."""
     if stream.msgtype not in NUMBERS:
         return None
     known = np.abs(stream.rows[np.isfinite(stream.rows)])
-    # Not the largest: a driver may say -999 while it knows none.
+    # The 95 % point, not the largest: a driver may say -999 while it has no heading.
     return "rad" if len(known) and float(np.percentile(known, 95)) < 2.0 * np.pi + 0.1 else "deg"
 
 
@@ -250,7 +274,7 @@ def _quaternions(stream: TopicData, rows: Array) -> Array:
 
 
 def headings(stream: TopicData) -> tuple[NDArray[np.int64], Array]:
-    """Return stamps (N,) and unwrapped yaw (N,), rad, as the messages say it, of those that say one."""
+    """Return the stamps (N,) and unwrapped yaws (N,), rad, of messages that say one, in their own convention."""
     keep = sane(stream)
     yaw = [yaw_of_x_axis(*(float(v) for v in q)) for q in _quaternions(stream, stream.rows[keep])]
     good = np.array([not isinstance(y, Rejection) for y in yaw], dtype=bool)
@@ -258,12 +282,13 @@ def headings(stream: TopicData) -> tuple[NDArray[np.int64], Array]:
 
 
 def says_the_same(first: TopicData, second: TopicData, *, mirrored: bool) -> bool:
-    """Return whether two headings are one, but for an offset and a delay: two devices never agree so closely while the craft turns.
+    """Return whether two topics hold one heading, but for an offset and a delay.
 
-    One of a type without a stamp is late by as long as its messages take, and a driver may stamp what it sends on its own.
+    Two devices never agree so closely while the craft turns. Messages of a type without a stamp are late by their way
+    to the recorder, and a driver may stamp messages by its own clock.
 
     Args:
-        mirrored: whether one of them grows as the other falls.
+        mirrored: whether one topic is clockwise and the other counter-clockwise.
     """
     (at, a), (there, b) = headings(first), headings(second)
     if len(at) < 10:
@@ -283,7 +308,7 @@ def says_the_same(first: TopicData, second: TopicData, *, mirrored: bool) -> boo
 
 
 def _middle_deg(angle: Array) -> tuple[float, float]:
-    """Return a robust mean and standard deviation of angles (N,), deg: fixes may jump or be frozen."""
+    """Return a robust mean and standard deviation, deg, of angles (N,), rad: fixes may jump or be frozen."""
     mean = float(np.angle(np.exp(1j * angle).mean()))
     middle = mean + float(np.median(wrap_angle(angle - mean)))
     scatter = float(robust_sigma(wrap_angle(angle - middle)))
@@ -291,12 +316,15 @@ def _middle_deg(angle: Array) -> tuple[float, float]:
 
 
 def _ahead(apart: Array, usual: float) -> Array:
-    """Return headings minus courses (N,), rad, as if the craft went ahead where it goes astern: there it is over 90 deg off `usual`."""
+    """Return headings minus courses (N,), rad, as if the craft had gone ahead where it goes astern.
+
+    It goes astern where the difference is over 90 deg off `usual`, rad.
+    """
     return usual + wrap_angle(2.0 * (apart - usual)) / 2.0
 
 
 def _wanders_deg(stamps_ns: NDArray[np.int64], angle: Array) -> float | None:
-    """Return how far the middle of angles (N,), rad, differs from block to block, 1 sigma, deg; None of fewer than three."""
+    """Return how far medians of blocks of angles (N,), rad, differ, 1 sigma, deg; None of fewer than three blocks."""
     block = (stamps_ns - stamps_ns[0]) // (_BLOCK_S * NS_PER_S)
     own = [angle[block == k] for k in np.unique(block)]
     middles = np.radians([_middle_deg(part)[0] for part in own if len(part) >= 5])

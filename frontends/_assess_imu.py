@@ -39,22 +39,25 @@ from graphloc.signals.series import integral, runs
 from graphloc.signals.white_noise import white_noise
 from graphloc.time import NS_PER_S
 
-_LEFT_OF_TURNS = 0.5  # of the changes of a course, that the turning about the right axis leaves at most
-# Of gravity, by the mount in tf, from body z; no mount is off by 30 deg unnoticed, one by 180 is; a choice.
+_LEFT_OF_TURNS = 0.5  # largest share of a course's changes that turning about the right axis leaves unexplained
+# Angle between gravity, by the mount in tf, and body z, from which the IMU is upside down. No mount is off by 30 deg
+# unnoticed, but one may be by 180; a choice.
 _UPSIDE_DOWN_DEG = 150.0
-# Quiet seconds in a row; for how long it is slow, at most, that only changes its direction.
+# Least number of quiet seconds in a row at standstill; a craft that only changes between ahead and astern is slow for a
+# shorter time than the second.
 _QUIET_S, _STANDS_S = 2, 1.5
-# Off body z, from which gravity is said to be; about a quarter turn, by which it, or the motion, overrules tf, and how coherent.
+# Angle between gravity and body z from which a note says so; how near 90 deg gravity or the motion must be off to
+# overrule tf; and the coherence that this takes of the motion.
 _TILTED_DEG, _QUARTER_DEG, _OVERRULES = 20.0, 20.0, 0.6
-_SLIGHTLY_DEG = 3.0  # off a quarter turn, from which it is said
-_ASKEW_DEG = 15.0  # off a quarter turn, from which an IMU sits askew: leeway, or an antenna far ahead, make less
-_AHEAD_DEG = 60.0  # off its x, within which a hint says that this is ahead rather than astern or aside
-_CAMERA = -0.7  # of gravity along y, below which its axes are a camera's
-_ON_ITS_HEAD = -0.7  # of gravity along z, below which a sensor is so, however it is tilted
+_SLIGHTLY_DEG = 3.0  # deviation from a multiple of 90 deg from which it is said
+_ASKEW_DEG = 15.0  # deviation from which an IMU sits askew: leeway, or an antenna far ahead, make less
+_AHEAD_DEG = 60.0  # yaw within which an unclear motion says that x is ahead rather than astern or aside
+_CAMERA = -0.7  # z component of y, levelled, below which the axes are a camera's (y down)
+_ON_ITS_HEAD = -0.7  # z component of the upward axis below which a sensor is upside down, however it is tilted
 
 
 def samples_of(imu: TopicData) -> tuple[NDArray[np.intp], list[str]]:
-    """Return the indices of usable samples, sorted by stamp, and warnings on frozen ones, which are dropped."""
+    """Return the indices of usable samples, sorted by stamp, and warnings on frozen samples, which are left out."""
     good = np.flatnonzero(~_clock.clock_jumps(imu.stamps_ns, imu.logs_ns))
     keep = good[_clock.in_order_or_late(imu.stamps_ns[good])]
     keep = keep[np.argsort(imu.stamps_ns[keep], kind="stable")]
@@ -63,7 +66,7 @@ def samples_of(imu: TopicData) -> tuple[NDArray[np.intp], list[str]]:
 
 
 class _Samples(NamedTuple):
-    """Usable samples of an IMU: stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s, and their frame."""
+    """Usable samples of an IMU: frame, stamps (N,), accelerations (N, 3), m/s^2, and angular rates (N, 3), rad/s."""
 
     frame_id: str
     stamps_ns: NDArray[np.int64]
@@ -71,13 +74,19 @@ class _Samples(NamedTuple):
     gyro: Array
 
     def turned(self, R: Array) -> _Samples:
-        """Return them in axes turned by R (3, 3)."""
+        """Return the samples in other axes, to which R (3, 3) takes."""
         return self._replace(accel=self.accel @ R.T, gyro=self.gyro @ R.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuEvidence:
-    """What an IMU is judged by: how the craft moved, by each source, the courses of the fixes, tf, and the yaws that odometries and poses tell, by topic."""
+    """What an IMU is judged by.
+
+    Attributes:
+        motions: how the craft moved, by each source, the most accurate first.
+        courses: of the fixes; None without fixes. tree: transforms of /tf_static.
+        yaws: by topic, of odometry and poses.
+    """
 
     motions: Sequence[MeasuredMotion]
     courses: Courses | None
@@ -92,8 +101,8 @@ class ImuEvidence:
 def _mount_guess(samples: _Samples, evidence: ImuEvidence) -> MountGuess:
     """Return the IMU's mount in body: from tf, else levelled by gravity and aligned with the motion.
 
-    Drivers publish in axes of their own under the frame of the URDF. Gravity or the motion overrules the latter where it is off by a
-    quarter turn; half a turn about the vertical may be a craft that goes astern.
+    Some drivers publish in axes of their own, though under the frame of the URDF. Where tf is off by a quarter turn,
+    gravity or the motion overrules it. Half a turn about the vertical may be a craft that goes astern, so tf stays.
     """
     motions, pose = evidence.motions, evidence.pose_of(samples.frame_id)
     if pose is None:
@@ -115,7 +124,7 @@ def _mount_guess(samples: _Samples, evidence: ImuEvidence) -> MountGuess:
 
 
 def _measured_mount(samples: _Samples, motions: Sequence[MeasuredMotion]) -> MountGuess:
-    """Return the mount that gravity levels and the motion turns."""
+    """Return the mount whose roll and pitch are by gravity, and whose yaw is by the motion."""
     up = np.median(samples.accel, axis=0)
     size = float(np.linalg.norm(up))
     if size < 0.5 * STANDARD_GRAVITY_MPS2:
@@ -141,25 +150,29 @@ def _measured_mount(samples: _Samples, motions: Sequence[MeasuredMotion]) -> Mou
 
 
 def _tilt_deg(R_body_imu: Array, accel: Array) -> float:
-    """Return by how much gravity, by accelerations (N, 3), is off body z with a mount; 0 where it was removed."""
+    """Return the angle of gravity, by accelerations (N, 3) and a mount, to body z, deg; 0 if gravity was removed."""
     up = np.median(accel, axis=0)
     size = float(np.linalg.norm(up))
     return float(np.degrees(np.arccos(np.clip((R_body_imu @ up)[2] / size, -1.0, 1.0)))) if size > 2.0 else 0.0
 
 
 def _in_place_of(pose: tuple[Array, Array], tilt_deg: float, mount: MountGuess) -> MountGuess:
-    """Return a measured mount instead of that in tf, whose place it keeps."""
+    """Return a measured mount that replaces the one in tf, of which only the position is kept."""
     why = f"not as in tf, by which gravity is {tilt_deg:.0f} deg off body z; {mount.evidence}"
     return replace(mount, xyz_m=vec(pose[0]), evidence=why)
 
 
 def _rpy_deg(R: Array) -> Vec:
-    """Return roll, pitch and yaw in deg of a rotation (3, 3), to a tenth."""
+    """Return roll, pitch and yaw of a rotation (3, 3), deg, rounded to a tenth."""
     return vec(np.round(np.degrees(rpy_from_rotation(R)), 1) + 0.0)  # + 0.0: no -0.0
 
 
 def _turned(samples: _Samples, motions: Sequence[MeasuredMotion], level: Array, said: str) -> MountGuess:
-    """Return the mount of a sensor that `level` (3, 3) levels, aligned with the motion; `said`: why it is known."""
+    """Return the mount of a sensor that is levelled by `level` (3, 3), with its yaw by the motion.
+
+    Args:
+        said: evidence of the level, in words.
+    """
     yaw, sigma, evidence = _mount_yaw(samples.turned(level), motions)
     told = yaw is not None
     if yaw is None:
@@ -172,9 +185,10 @@ def _turned(samples: _Samples, motions: Sequence[MeasuredMotion], level: Array, 
 
 
 def turned_as_its_heading(imu: ImuReport, compasses: Sequence[CompassReport]) -> ImuReport:
-    """Return the report with the mount turned where nothing tells its yaw, but its own orientation says that x is ahead or astern.
+    """Return the report with the mount's yaw by the IMU's own orientation, where nothing else tells it.
 
-    Not by orientations a quarter turn off the course: headings from north, or in other axes than the driver names, are so as well.
+    The orientation must be along the course or opposite to it. One a quarter turn off it tells nothing: so are headings
+    that count from north, or that are in other axes than the driver names.
     """
     own = next((c for c in compasses if c.topic == imu.topic and (c.ahead or c.backwards)), None)
     if own is None or imu.mount.yaw_told:
@@ -194,10 +208,13 @@ def turned_as_its_heading(imu: ImuReport, compasses: Sequence[CompassReport]) ->
 def turned_as_headed(
     imu: TopicData, report: ImuReport, evidence: ImuEvidence, headed: Sequence[MeasuredMotion]
 ) -> ImuReport:
-    """Return the report with the mount turned where the courses do not tell its yaw, but headings do: of a craft that goes ahead and astern.
+    """Return the report with the mount's yaw by headings, where courses do not tell it.
+
+    Courses do not where a craft goes ahead and astern.
 
     Args:
-        headed: how the craft moved, with where it headed.
+        imu, report: an IMU and its report. evidence: see `ImuEvidence`.
+        headed: how the craft moved, with the heading.
     """
     if report.mount.yaw_told or not headed:
         return report
@@ -212,9 +229,10 @@ def turned_as_headed(
 
 
 def _level(axis: Array) -> Array:
-    """Return the smallest rotation (3, 3) that takes a unit vector to +z; of a sensor on its head, after half a turn about x.
+    """Return the smallest rotation (3, 3) that takes a unit vector to +z.
 
-    Either way x stays ahead. From -z the smallest rotation alone is about any axis: of a sensor tilted a little forward, x went astern.
+    Of a sensor upside down, it follows half a turn about x, so that x stays ahead. Near -z the axis of the smallest
+    rotation is arbitrary: of a sensor upside down and tilted a little forward, x would point astern.
     """
     turned = np.diag([1.0, -1.0, -1.0]) if axis[2] < _ON_ITS_HEAD else np.eye(3)
     up, z = turned @ axis, np.array([0.0, 0.0, 1.0])
@@ -227,9 +245,11 @@ def _level(axis: Array) -> Array:
 
 
 def _mount_yaw(levelled: _Samples, motions: Sequence[MeasuredMotion]) -> tuple[float | None, float | None, str]:
-    """Return the yaw (deg) that fits the motion, None where nothing tells it, and the evidence.
+    """Return the yaw of a levelled IMU by the motion, its sigma, and the evidence in words.
 
-    It is a multiple of 90 deg unless the motion clearly contradicts that: then 1 sigma of it, deg, comes with it, else None.
+    Returns:
+        The yaw, deg: a multiple of 90 unless the motion clearly contradicts it; None where nothing tells it. Its 1
+        sigma, deg, if it is no multiple of 90; else None. The evidence.
     """
     if not motions:
         return None, None, "no motion to find its yaw from"
@@ -257,21 +277,21 @@ def _mount_yaw(levelled: _Samples, motions: Sequence[MeasuredMotion]) -> tuple[f
 
 
 class Inertial(NamedTuple):
-    """What an IMU tells: the motion, in the axes of the vessel, and its usable samples, in its own."""
+    """What an IMU tells: the motion that it feels, in axes of the vessel, and its usable samples, in its own axes."""
 
     felt: Felt
     series: ImuSeries
 
 
 def inertial_of(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> Inertial:
-    """Return what an IMU tells whose mount is known or guessed."""
+    """Return what an IMU tells, with the mount of its report."""
     series = _series_of(imu, report)
     gravity_mps2 = 0.0 if report.gravity == "removed" else STANDARD_GRAVITY_MPS2
     return Inertial(Felt.of(*_in_body(series, report, evidence), gravity_mps2), series)
 
 
 def feels_motion(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> bool:
-    """Return whether an IMU whose mount is known or guessed clearly feels how the craft moves, whichever way its mount is turned, or turns as it does."""
+    """Return whether an IMU turns as the courses do, or clearly feels how the craft moves, whatever its mount's yaw."""
     if _against_courses(imu, report, evidence) > 0:
         return True
     found = yaw_in_craft(*_in_body(_series_of(imu, report), report, evidence), evidence.motions)
@@ -279,14 +299,17 @@ def feels_motion(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> bo
 
 
 def _turning_of(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> Turning:
-    """Return the integrated rate of an IMU whose mount is known or guessed, with its gyro bias removed if known."""
+    """Return the integrated yaw rate of an IMU, with the mount of its report and without its gyro bias, if known."""
     stamps, _, gyro = _in_body(_series_of(imu, report), report, evidence)
     t = (stamps - stamps[0]) / NS_PER_S
     return Turning(int(stamps[0]), t, integral(t, gyro[:, 2]))
 
 
 def _in_body(series: ImuSeries, report: ImuReport, evidence: ImuEvidence) -> tuple[NDArray[np.int64], Array, Array]:
-    """Return stamps (N,), accelerations (N, 3) m/s^2 and rates (N, 3) rad/s in the axes of the vessel, without the gyro bias, if known."""
+    """Return stamps (N,), accelerations (N, 3), m/s^2, and rates (N, 3), rad/s, in the axes of the vessel.
+
+    The rates are without the gyro bias, if it is known.
+    """
     known = evidence.pose_of(report.mount.tf_frame)
     R = known[1] if known else rotation_from_rpy_deg(np.array(report.mount.rpy_deg))
     unbiased = series.gyro_radps - (report.gyro_bias_radps or (0.0, 0.0, 0.0))
@@ -294,7 +317,7 @@ def _in_body(series: ImuSeries, report: ImuReport, evidence: ImuEvidence) -> tup
 
 
 def _series_of(imu: TopicData, report: ImuReport) -> ImuSeries:
-    """Return the usable samples of an IMU that has a report, in SI units, axes of the sensor."""
+    """Return the usable samples of an IMU in SI units, by its report, and in the axes of the sensor."""
     keep, _ = samples_of(imu)
     keep = keep[np.isfinite(imu.rows[keep, :6]).all(axis=1)]
     unit = STANDARD_GRAVITY_MPS2 if report.accel_unit == "g" else 1.0
@@ -308,7 +331,7 @@ def _series_of(imu: TopicData, report: ImuReport) -> ImuSeries:
 
 
 def _against_courses(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> int:
-    """Return +1 if the gyro turns like the course of the fixes, -1 if opposite, 0 if unclear."""
+    """Return +1 if the gyro turns as the courses of the fixes do, -1 if opposite, 0 if that is unclear."""
     courses = evidence.courses
     if courses is None or len(courses.stamps_ns) < 20:
         return 0
@@ -317,7 +340,7 @@ def _against_courses(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -
 
 
 def _turning_axis(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> Array | None:
-    """Return the axis (3,) of the sensor, or its opposite, about which it turns as the courses of the fixes do; None if nothing tells."""
+    """Return the sensor axis (3,), with its sign, about which it turns as the courses do; None if that is unclear."""
     courses = evidence.courses
     if courses is None or len(courses.stamps_ns) < 20:
         return None
@@ -331,10 +354,11 @@ def _turning_axis(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> A
 
 
 def _righted(report: ImuReport, imu: TopicData, samples: _Samples, evidence: ImuEvidence) -> ImuReport:
-    """Return the report with accelerations of the opposite sign, if only that fits the courses.
+    """Return the report corrected by how the gyroscope turns beside the courses of the fixes.
 
-    Levelled by accelerations of the wrong sign, the sensor is upside down and its gyroscope turns the wrong way. If the mount is from
-    tf, the gyroscope turns correctly, and gravity points down.
+    Levelled by accelerations of the wrong sign, a sensor comes out upside down, and its gyroscope turns against the
+    courses; with a mount from tf it turns as they do, but gravity points down. If the gyroscope turns against the
+    courses with a mount from tf, that mount is wrong. Without gravity, the courses tell which axis is up.
     """
     motions, pose = evidence.motions, evidence.pose_of(report.mount.tf_frame)
     if pose is None and report.gravity == "removed":
@@ -375,7 +399,7 @@ def _righted(report: ImuReport, imu: TopicData, samples: _Samples, evidence: Imu
 
 
 def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
-    """Return units, gravity, standstill, noise and mount of an IMU; None if it has less than 20 samples."""
+    """Return units, gravity, standstill, noise and mount of an IMU; None if it has fewer than 20 finite samples."""
     keep, frozen = samples_of(imu)
     rows = imu.rows[keep] if len(keep) else np.zeros((0, 13))
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(rows[:, :6]).all(axis=1))
@@ -433,7 +457,10 @@ def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
 
 
 class _Units(NamedTuple):
-    """Units of accelerations and rates, whether gravity is in them, the median acceleration, and whether rates are fast, as `ImuReport` has them."""
+    """Units of accelerations and rates, 'included' or 'removed' gravity, the median acceleration, and the evidence.
+
+    `fast`: whether rates are large for rad/s, which they are by how the craft turns. See `ImuReport`.
+    """
 
     accel: str
     gyro: str
@@ -444,7 +471,11 @@ class _Units(NamedTuple):
 
 
 def _yaws_beside(stamps: NDArray[np.int64], orientation: Array, evidence: ImuEvidence) -> dict[str, Yaws]:
-    """Return what turns with an IMU, by what it does: its own orientation (N, 4), at stamps (N,), where it has one; odometries and poses; courses."""
+    """Return the yaws that an IMU's turns are compared with, by a name for the evidence.
+
+    Args:
+        stamps, orientation: (N,), and (N, 4) of the IMU itself, if it has any. evidence: has poses and courses.
+    """
     own = yaws_of(stamps, orientation)
     found = {"its own orientation does": own} if own else {}
     found |= {f"the poses of {topic} do": yaws for topic, yaws in evidence.yaws.items()}
@@ -454,7 +485,7 @@ def _yaws_beside(stamps: NDArray[np.int64], orientation: Array, evidence: ImuEvi
 
 
 def yaws_of(stamps: NDArray[np.int64], quaternions: Array) -> Yaws | None:
-    """Return the stamps and yaws of attitudes (N, 4), at stamps (N,); None where half of them are none."""
+    """Return the stamps and yaws of unit quaternions (N, 4), at stamps (N,); None where half of them are invalid."""
     whole = np.isfinite(quaternions).all(axis=1) & (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) < 0.1)
     if not len(whole) or whole.mean() <= 0.5:
         return None
@@ -463,9 +494,13 @@ def yaws_of(stamps: NDArray[np.int64], quaternions: Array) -> Yaws | None:
 
 
 def _units_of(imu: ImuSeries, beside: Mapping[str, Yaws]) -> _Units:
-    """Return the likely units of samples as they are told: of rates by how they turn beside what turns with them; where that is not clear, by their size.
+    """Return the likely units of samples.
 
-    Where gravity does not turn either, as of a robot that pivots, size alone takes rad/s for deg/s.
+    The unit of rates is the one in which they turn as `beside` does; where that is not clear, it is judged by their
+    size. Size alone would take the rad/s of a robot that pivots, whose gravity does not turn, for deg/s.
+
+    Args:
+        imu: samples as they are told, in any unit. beside: of `_yaws_beside`.
     """
     stamps, accel, gyro = imu.stamps_ns, imu.accel_mps2, imu.gyro_radps
     size, at_ease = size_at_ease(accel, gyro)
@@ -496,10 +531,10 @@ def _units_of(imu: ImuSeries, beside: Mapping[str, Yaws]) -> _Units:
 def _standstill(
     stamps: NDArray[np.int64], accel: Array, gyro: Array, motion: MeasuredMotion | None
 ) -> NDArray[np.bool_]:
-    """Return (N,) whether a sample is in several quiet seconds in a row, at a speed of zero if that is known.
+    """Return (N,) whether a sample is in several quiet seconds in a row, at a speed of zero if the speed is known.
 
-    A rolling vessel is quiet for a second at each end of its motion, and one that goes astern has no speed for a moment: its rate then
-    is not a bias.
+    A rolling vessel is quiet for a second at each end of a roll, and one that changes from ahead to astern has no speed
+    for a moment. Their rates then are no bias.
     """
     second = (stamps - stamps[0]) // NS_PER_S
     quiet = np.zeros(int(second[-1]) + 1, dtype=bool)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Assess velocities by the GNSS track: in which axes they are, and which gives the vessel's motion best."""
+"""Assess velocities by the GNSS track: in which axes they are, and which source tells the vessel's motion best."""
 
 from __future__ import annotations
 
@@ -31,29 +31,34 @@ from graphloc.frontends.decode import ODOMETRY, POINT, VECTOR
 from graphloc.signals.series import integral, interpolated
 from graphloc.time import NS_PER_S
 
-_CHORD_S, _LONG_CHORD_S = 2.0, 10.0  # in which a craft turns little; and over which fixes wander by less than it goes
-_FOLLOWS, _NO_WANDER = 0.5, 3.0  # correlation; RMS of what is across, over that along
-_JUMP = 0.03  # of the chords, at most, that fit no axes as the fixes jump
-_FITS = 0.4  # largest error of an axis convention that fits, as a share of the speed
+# Durations of chords: a craft turns little in the short one; over the long one fixes wander by less than the craft
+# goes.
+_CHORD_S, _LONG_CHORD_S = 2.0, 10.0
+# Of a craft that goes east or west: least correlation of y with the speed north, from which y is north; least RMS of
+# the speed north over that of the differences along the course, from which the speed north is no wander of the fixes.
+_FOLLOWS, _NO_WANDER = 0.5, 3.0
+_JUMP = 0.03  # share of chords that are left out: where fixes jump, they fit no axes
+_FITS = 0.4  # largest RMS difference of axes that fit, as a share of the speed
 _AXES = (EAST_AXES, NORTH_AXES, BODY_AXES)
 _INS = re.compile(r"(^|[/_])(o?ins|oxts|inspvax?|span)([/_]|$)", re.IGNORECASE)
 EITHER = f"{EAST_AXES}, or {BODY_AXES}"
 _OF_GNSS = re.compile(r"gps|gnss|fix|ublox|novatel|septentrio|antenna|enu", re.IGNORECASE)
 _OF_LOG = re.compile(r"dvl|doppler|wheel|speed_?log", re.IGNORECASE)
-_FEWEST = 20  # velocities, or fixes: two to twenty seconds; of fewer an axis is a matter of chance; a choice
-_FAR_WORSE = 5.0  # times the sigma that most fixes claim
-_ASTERN, _MOVES_MPS = 0.95, 0.3
-_ALONG = 0.9  # of its x along that of the body: a log that is turned by more tells the speed ahead by its y, too
+_FEWEST = 20  # least number of velocities or fixes, two to twenty seconds: of fewer, axes are chance; a choice
+_FAR_WORSE = 5.0  # fixes that claim over so many times the median sigma are left out
+_ASTERN, _MOVES_MPS = 0.95, 0.3  # if so large a share of the larger speeds is astern, the sign looks wrong
+_ALONG = 0.9  # cosine between x of a log and of the body: if it is less, the log's y tells speed ahead, too
 _REVERSED = "it goes astern nearly all the time: its sign looks wrong, and is taken for reversed"
 
 
 def axes_of(stream: TopicData, reference: ReferenceTrack, R_body_sensor: Array | None = None) -> tuple[str | None, str]:
     """Return the axes in which the velocities of a stream fit chords of a track, and the evidence in words.
 
-    The axes are None if the data do not show them, 'unknown' if none fits, `EITHER` if two do.
+    The axes are None if the data do not show them, 'unknown' if no axes fit, `EITHER` if two do.
 
     Args:
-        stream: velocities in its last three columns. R_body_sensor: (3, 3), where its axes are turned in the body.
+        stream: has velocities in its last three columns. reference: the track.
+        R_body_sensor: (3, 3), if the axes of the sensor are turned in the body.
     """
     R = np.eye(3) if R_body_sensor is None else R_body_sensor
     axes, why = _axes_by(stream, reference, _CHORD_S, R)
@@ -67,17 +72,17 @@ def axes_of(stream: TopicData, reference: ReferenceTrack, R_body_sensor: Array |
 def _axes_by(
     stream: TopicData, reference: ReferenceTrack, chord_s: float, R_body_sensor: Array
 ) -> tuple[str | None, str]:
-    """Return the same by chords of one length."""
+    """Return the same as `axes_of`, by chords of one duration."""
     keep = sane(stream, np.s_[-3:])
     v = stream.rows[keep, -3:] if len(keep) else np.zeros((0, 3))
     chords, mean = _pairs(stream.stamps_ns[keep], v, reference, chord_s)
-    noise = 2.0 * reference.scatter_m / chord_s  # of a chord between two places, both axes together, m/s
+    noise = 2.0 * reference.scatter_m / chord_s  # of the mean velocity of a chord, in both axes together, m/s
     forward = chords / np.maximum(np.hypot(*chords.T), 1e-9)[:, None]
-    # Body x laid along the track, either way: a craft may go astern.
+    # The speed along body x, laid along the chord whichever its sign: a craft may go astern.
     in_body = mean @ R_body_sensor.T
     along = forward * np.abs(in_body[:, :1])
     squared = np.array([((v - chords) ** 2).sum(axis=1) for v in (mean[:, :2], mean[:, 1::-1], along)])
-    # Where the fixes jump, none fits; a few such chords would hide all the others.
+    # Where the fixes jump, no axes fit; a few such chords would dominate the RMS.
     least = squared.min(axis=0)
     kept = least <= np.quantile(least, 1.0 - _JUMP) if len(least) else np.zeros(0, dtype=bool)
     chords, in_body, squared = chords[kept], in_body[kept], squared[:, kept]
@@ -89,7 +94,7 @@ def _axes_by(
             None,
             f"the fixes scatter by {reference.scatter_m:.1f} m, too much to check it against at {speed:.1f} m/s",
         )
-    # What lies along the chords has their noise across them, too.
+    # A speed laid along the chords differs from them along their direction only: half of the noise's power.
     parts = (1.0, 1.0, 0.5**0.5)
     errors = [_less(float(np.sqrt(own.mean())), part * noise) for own, part in zip(squared, parts, strict=True)]
     best = int(np.argmin(errors))
@@ -104,36 +109,40 @@ def _axes_by(
 
 
 def _east_or_ahead(chords: Array, mean: Array) -> str | None:
-    """Return the axes of velocities that fit both, of a craft that goes about east or west: by whether their y is what it goes north.
+    """Return which axes velocities have that fit as east, north and as body axes, of a craft that goes east or west.
 
-    Both errors do not tell: beside the chords' own direction nothing that the fixes wander across them counts.
+    It is told by whether their y is the speed north; None if that is unclear. The errors of the two fits do not tell:
+    only east, north counts the wander of the fixes across the course.
 
     Args:
-        chords: (N, 2), m/s. mean: (N, 3), of the stream over the same times.
+        chords: (N, 2), m/s. mean: (N, 3), m/s, means of the stream over the same times.
     """
     north, y, along = chords[:, 1], mean[:, 1], np.abs(mean[:, 0]) - np.hypot(*chords.T)
     together = float(y @ north)
     if together > _FOLLOWS * max(float(y @ y), float(np.sqrt((y @ y) * (north @ north)))):
         return EAST_AXES
-    # What it went north is no wander of the fixes, and y does not tell of it.
+    # The craft went north by more than the fixes wander, and y does not show it.
     return BODY_AXES if float(north @ north) > _NO_WANDER**2 * float(along @ along) else None
 
 
 def _less(rms: float, noise: float) -> float:
-    """Return an RMS without the part of its noise."""
+    """Return an RMS from which the power of a noise is taken off."""
     return float(np.sqrt(max(rms**2 - noise**2, 0.0)))
 
 
 def velocity_report(stream: TopicData, reference: ReferenceTrack, pose: Pose | None) -> VelocityReport:
-    """Return the axes of a twist or vector: of its frame, if tf has it; else as `axes_of`. Of a Doppler log also the mount.
+    """Return the report of a twist or vector: its axes, and of a Doppler log also its mount.
+
+    The axes are tried as turned by tf, if tf knows the frame; if these do not fit, as they are.
 
     Args:
-        stream, reference: as for `axes_of`. pose: T_body_sensor by tf, which connects its frame with the body.
+        stream, reference: see `axes_of`. pose: T_body_sensor by tf; None if tf does not connect its frame with the
+            body.
     """
     log = _of_doppler_log(stream)
     R_body_sensor = None if log or pose is None else pose[1]
     axes, why = axes_of(stream, reference, R_body_sensor)
-    if axes == "unknown" and R_body_sensor is not None:  # of axes that are not those of tf
+    if axes == "unknown" and R_body_sensor is not None:  # its axes are not those of its frame in tf
         R_body_sensor = None
         axes, why = axes_of(stream, reference)
     axes, why = _axes_by_kind(stream, axes, why)
@@ -161,7 +170,7 @@ def _of_doppler_log(stream: TopicData) -> bool:
 
 
 def _axes_by_kind(stream: TopicData, axes: str | None, why: str) -> tuple[str | None, str]:
-    """Return the axes, and why, that the type of a velocity, its names or its sentence tell, or else the track.
+    """Return the axes of a velocity, and why, by its type, names or sentence; where these tell nothing, by the track.
 
     Args:
         axes, why: by the track, see `axes_of`.
@@ -185,10 +194,10 @@ def _axes_by_kind(stream: TopicData, axes: str | None, why: str) -> tuple[str | 
 
 
 def _mount_of_log(frame: str, pose: Pose | None, reverse: bool) -> MountGuess:
-    """Return the mount of a Doppler log, whose own z is down; drivers name frames of tf whose z is up.
+    """Return the mount of a Doppler log, whose z is down though drivers may name a frame of tf whose z is up.
 
     Args:
-        frame: of its messages. pose: T_body_frame by tf. reverse: it says astern throughout.
+        frame: of its messages. pose: T_body_frame by tf; None if unknown. reverse: its speeds are astern throughout.
     """
     if pose is None:
         down = (180.0, 0.0, 180.0 if reverse else 0.0)
@@ -202,7 +211,7 @@ def _mount_of_log(frame: str, pose: Pose | None, reverse: bool) -> MountGuess:
 
 
 def _astern(forward_mps: Array) -> bool:
-    """Whether speeds (N,) along the vessel are negative nearly whenever it moves."""
+    """Return whether speeds (N,) along the vessel, m/s, are negative nearly whenever it moves."""
     moves = np.abs(forward_mps) > _MOVES_MPS
     return bool(moves.sum() >= _FEWEST and (forward_mps[moves] < 0.0).mean() > _ASTERN)
 
@@ -211,7 +220,7 @@ def odometry_report(stream: TopicData, reference: ReferenceTrack, world: World) 
     """Return the likely role of an odometry or pose topic, by its name and whether it reports the speed of the vessel.
 
     Args:
-        reference: as for `axes_of`. world: its frame, by `world_of`.
+        stream: odometry or poses. reference: see `axes_of`. world: its frame, by `world_of`.
     """
     rows = stream.rows[sane(stream)]
     speed = float(np.nanmax(np.abs(rows[:, 7]))) if len(rows) and np.isfinite(rows[:, 7]).any() else 0.0
@@ -247,7 +256,7 @@ def odometry_report(stream: TopicData, reference: ReferenceTrack, world: World) 
 
 
 def _fused(topic: str, world: World) -> str:
-    """Return why an odometry is the output of a filter or an INS; '' where nothing says so."""
+    """Return why an odometry is the output of a filter or an INS; '' if nothing says so."""
     if filtered(topic):
         return "a filter's output by its name"
     if _INS.search(topic):
@@ -264,11 +273,12 @@ def motions_of(
 ) -> list[MeasuredMotion]:
     """Return the motion of the vessel by wheels, velocities and fixes, the most accurate source of speed first.
 
-    Args:
-        wheels: odometry that reports the speed along the vessel. twists: velocities and their axes; those that fit the track in
-            no axes are something else, as a `Vector3Stamped` may be anything.
+    A Doppler log whose mount is not in tf may be mounted at 45 deg, so it is asked only where nothing else tells.
 
-    A Doppler log of which no tf tells how it sits, and its maker may have it at 45 deg, is asked only where nothing else moves.
+    Args:
+        wheels: odometry that reports the speed along the vessel. fixes: of receivers.
+        twists: velocities and their reports. One that fits the track in no axes is left out: a `Vector3Stamped` may
+            hold anything.
     """
     logs: list[MeasuredMotion] = []
     found = [m for s in wheels if (m := _told(s, BODY_AXES)) and float(np.ptp(m.speed_mps)) > 0.2]
@@ -281,7 +291,7 @@ def motions_of(
 
 
 def _motion_of(stream: TopicData, report: VelocityReport) -> MeasuredMotion | None:
-    """Return the motion by a velocity over ground; None where its axes are not known, or it hardly moves."""
+    """Return the motion by a velocity over ground; None where its axes are not known, or the craft hardly moves."""
     known = report.axes in (EAST_AXES, NORTH_AXES) if stream.msgtype == VECTOR else report.axes != "unknown"
     if not known or through_water(stream.topic):
         return None
@@ -294,7 +304,7 @@ def _motion_of(stream: TopicData, report: VelocityReport) -> MeasuredMotion | No
 
 
 def motion_of_poses(poses: TopicData) -> MeasuredMotion | None:
-    """Return the motion that poses tell, with their attitude, if they have one; None of few."""
+    """Return the motion that poses tell, with the attitude if they have one; None of too few poses."""
     keep = sane(poses, np.s_[:3])
     q = poses.rows[keep, 3:7]
     whole = np.isfinite(q).all(axis=1) & (np.abs(np.linalg.norm(q, axis=1) - 1.0) < 0.1)
@@ -307,7 +317,10 @@ def motion_of_poses(poses: TopicData) -> MeasuredMotion | None:
 
 
 def _as_good_as_most(stamps_ns: NDArray[np.int64], p_m: Array, rows: Array) -> tuple[NDArray[np.int64], Array]:
-    """Return stamps (N,) and places (N, 3) without those that claim to be far worse than most: floats beside RTK hide what a craft does."""
+    """Return stamps (N,) and positions (N, 3) of the fixes that do not claim to be far worse than most.
+
+    RTK floats among fixed solutions would hide the motion.
+    """
     claimed = np.sqrt(np.maximum(rows[:, 5:7].max(axis=1, initial=0.0), 0.0))
     usual = float(np.median(claimed)) if len(claimed) else 0.0
     good = claimed <= _FAR_WORSE * usual if np.isfinite(usual) and usual > 0.0 else np.ones(len(claimed), dtype=bool)
@@ -315,7 +328,11 @@ def _as_good_as_most(stamps_ns: NDArray[np.int64], p_m: Array, rows: Array) -> t
 
 
 def _told(stream: TopicData, axes: str, R_body_sensor: Array | None = None) -> MeasuredMotion | None:
-    """Return the motion by a stream of velocities; NaN before the first fix. `R_body_sensor`: (3, 3), where its axes are turned."""
+    """Return the motion by a stream of velocities in some axes; None of too few.
+
+    Args:
+        R_body_sensor: (3, 3), if the axes of the sensor are turned in the body.
+    """
     keep = sane(stream, np.s_[-3:-1])
     if len(keep) <= _FEWEST:
         return None
@@ -330,7 +347,11 @@ def _told(stream: TopicData, axes: str, R_body_sensor: Array | None = None) -> M
 
 
 def _pairs(stamps_ns: NDArray[np.int64], v: Array, reference: ReferenceTrack, chord_s: float) -> tuple[Array, Array]:
-    """Return the track's mean velocities (M, 2) over some seconds, and the twists' (M, 3) over the same."""
+    """Return the mean velocities (M, 2) of a track over chords, and those (M, 3) of a stream over the same times, m/s.
+
+    Args:
+        stamps_ns, v: (N,) and (N, 3), m/s, of the stream. chord_s: duration of a chord, at least.
+    """
     none = np.zeros((0, 2)), np.zeros((0, 3))
     if len(stamps_ns) < 10 or len(reference.stamps_ns) < 3:
         return none

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast the error of fixes changes, and how far: by their chords against those of wheels, or of the receiver's own velocity."""
+"""How fast and how far the error of fixes changes: chords of fixes against those of wheels or of a velocity."""
 
 from __future__ import annotations
 
@@ -17,31 +17,34 @@ from graphloc.signals.series import interpolated, rms, robust_sigma
 from graphloc.time import NS_PER_S
 
 SPANS_S = (10.0, 20.0, 40.0, 80.0)
-"""Times from one end of a chord to the other, s: one span does not tell a large error that changes slowly from a small, fast one."""
-_LEAST_M = 3.0  # of a shorter chord the length is mostly error
-_SHORTEST_S = 110.0  # of motion: some ten of the shortest chords that do not overlap
-_FEWEST = 3.0  # chords of a span that do not overlap
-_SLIP, _DOPPLER = 0.03, 0.01  # of a chord: so much may be the wheels', or a turn's; or the velocity's
-_BEYOND = 2.0  # times the variance by default, from which the changes say that it is another error
-# What slow errors are before a run shows any: their sigma is as by default, or claimed, within a factor; they change within minutes.
+"""Durations of chords, s: one duration does not tell a large error that changes slowly from a small, fast one."""
+_LEAST_M = 3.0  # the length of a shorter chord is mostly error
+_SHORTEST_S = 110.0  # least duration of motion: some ten of the shortest chords that do not overlap
+_FEWEST = 3.0  # least number of chords of a span that do not overlap
+_SLIP, _DOPPLER = 0.03, 0.01  # shares of a chord that may be errors of wheels, or a turn; of a velocity
+_BEYOND = 2.0  # times the default's variance: below, changes do not say that the error is another one
+# Prior of slow errors: median of the correlation time; 1 sigma, as factors, of their sigma about the default or claimed
+# one, and of the correlation time.
 _USUAL_S, _WITHIN, _WITHIN_S = 100.0, 2.5, 3.0
-_DEPENDENT = 0.5  # share of the weight that changes over several spans of one run have, as they are made of each other
-_SIGMAS = np.geomspace(0.25, 32.0, 78)  # times the sigma by default; one is 1
-_DRIFTS_RADPS = np.linspace(-0.02, 0.02, 41)  # of the heading of wheels; a gyroscope's bias at most
+_DEPENDENT = 0.5  # weight of changes over several spans of one run: they are sums of each other
+_SIGMAS = np.geomspace(0.25, 32.0, 78)  # times the default sigma; one of them is 1
+_DRIFTS_RADPS = np.linspace(-0.02, 0.02, 41)  # of the heading of wheels: up to the bias of a poor gyroscope
 _TIMES_S = np.geomspace(5.0, 600.0, 50)
 
 
 def changes(
     motion: MeasuredMotion, stamps_ns: NDArray[np.int64], p_m: Array, scatter_m: float, *, turned: bool
 ) -> tuple[Change, ...]:
-    """Return by how much the error of fixes changes along the way within each of `SPANS_S`; none where that is not told.
+    """Return by how much the error of fixes changes within each of `SPANS_S`; empty where that is not told.
 
-    By a velocity to the east and north: of chords. By wheels: of their lengths, so that no heading is needed; the scale is the median's,
-    and their heading may drift steadily. Ways of wheels, or of an integrated velocity, drift little in so short times; and jumps, of which there are few, hardly count.
+    Chords of the fixes are compared with those of a way that drifts little in so short a time. A velocity to the east
+    and north is compared as a vector. Of wheels only the lengths of chords are compared, so that no heading is needed;
+    their scale is the median ratio, and a steady drift of their heading is removed. Jumps are few, and hardly count.
 
     Args:
-        motion: with a way. stamps_ns: (N,) of the fixes. p_m: (N, 3), east, north, up. scatter_m: noise of each, 1 sigma of an axis.
-        turned: whether the way has axes of its own, and a scale: that of wheels.
+        motion: has a way. stamps_ns, p_m: (N,), and (N, 3), m, east, north, up, of the fixes.
+        scatter_m: white noise of a fix, 1 sigma of an axis.
+        turned: whether the way has axes and a scale of its own, as that of wheels.
     """
     if motion.way_m is None or not len(motion.t_s):
         return ()
@@ -69,7 +72,10 @@ def changes(
 
 
 def _chords(t_s: Array, p_m: Array, moved_m: Array, span_s: float) -> tuple[Array, Array]:
-    """Return the chords (N, 2) of two ways (K, 2) over so many seconds, not across an outage, of which the latter are no mere error."""
+    """Return the chords (N, 2) of two ways (K, 2) over so many seconds, none across an outage.
+
+    Chords of which the second way says that they are short are left out: their length is mostly error.
+    """
     end = np.searchsorted(t_s, t_s + span_s)
     begin = np.flatnonzero(end < len(t_s))
     begin = begin[t_s[end[begin]] - t_s[begin] < 1.5 * span_s]
@@ -79,16 +85,20 @@ def _chords(t_s: Array, p_m: Array, moved_m: Array, span_s: float) -> tuple[Arra
 
 
 def _longer(fixed_m: Array, chord_m: Array) -> Array:
-    """Return by how much chords of fixes (N, 2) are longer than those of wheels (N, 2), whose scale is the median's, beyond the median, m."""
+    """Return (N,) by how much chords of fixes (N, 2) exceed scaled chords of wheels (N, 2), less the median, m.
+
+    The scale is the median ratio of their lengths.
+    """
     fixed, chord = np.hypot(*fixed_m.T), np.hypot(*chord_m.T)
     off = fixed - np.median(fixed / chord) * chord
     return np.asarray(off - np.median(off))
 
 
 def _steered(t_s: Array, p_m: Array, moved_m: Array) -> Array:
-    """Return the way of wheels (N, 2) without the steady drift of its heading: that without which its chords are most as long as the fixes'.
+    """Return the way of wheels (N, 2), m, without the steady drift of its heading.
 
-    A drift of 0.2 deg/s turns a way by 16 deg in 80 s: where the craft turned meanwhile, chords of 500 m are then tens of metres off.
+    The drift is the one without which the lengths of its chords fit those of the fixes best. A drift of 0.2 deg/s turns
+    a way by 16 deg in 80 s: if the craft turned meanwhile, chords of 500 m are tens of metres off.
     """
     steps = np.diff(moved_m @ np.array([1.0, 1j]), prepend=0.0)
     some = np.s_[:: max(1, round(1.0 / max(float(np.median(np.diff(t_s))), 1e-3)))]  # one a second tells as much
@@ -100,21 +110,22 @@ def _steered(t_s: Array, p_m: Array, moved_m: Array) -> Array:
     def misfit(drift_radps: float) -> float:
         own_m = way_m(drift_radps)[some]
         chords = [(span_s, *_chords(t_s[some], p_m[some], own_m, span_s)) for span_s in SPANS_S]
-        # A wandering error changes with the root of the span.
+        # The change of a wandering error grows with the root of the span.
         return float(sum(robust_sigma(_longer(a, b)) / np.sqrt(span_s) for span_s, a, b in chords if len(a)))
 
     return way_m(min(_DRIFTS_RADPS, key=lambda drift: (misfit(drift), abs(drift))))
 
 
 def slow_error_by(wander: Sequence[Change], sigma_m: float) -> tuple[float, float] | None:
-    """Return sigma (m) and correlation time (s) of a Gauss-Markov error that changes so; None where it changes as by default, or less.
+    """Return sigma (m) and correlation time (s) of the Gauss-Markov error that explains changes.
 
-    Changes over the longest spans are few, and what lasts for longer is not seen at all: so each pair is weighed by how well it explains
-    what is seen, and by how usual it is, and their mean is taken (of the logarithms). The sigma is at least that by default, as what
-    does not change shows in no change.
+    None where the changes are those of the default error, or less. Changes over the longest spans are few, and an error
+    that lasts for longer is not seen at all. So the posterior mean, of logarithms, is taken over a grid: each pair of
+    sigma and time is weighed by its likelihood and its prior. The sigma is at least the default's, since no change
+    shows an error that is constant.
 
     Args:
-        wander: by `changes`. sigma_m: that is usual, or claimed.
+        wander: by `changes`. sigma_m: usual or claimed sigma, the median of the prior.
     """
     if not wander:
         return None
@@ -138,16 +149,16 @@ def slow_error_by(wander: Sequence[Change], sigma_m: float) -> tuple[float, floa
 
 
 def _mean(values: Array, cost: Array) -> float:
-    """Return the mean of positive values, by their logarithms, each weighed by its cost (nats)."""
+    """Return the geometric mean of values, weighed by exp(-cost), cost in nats."""
     return float(np.exp(np.average(np.log(values), weights=np.exp(cost.min() - cost))))
 
 
 def _variance(sigma_m: Array | float, time_s: Array | float, span_s: Array) -> Array:
-    """Return the variance by which a Gauss-Markov process changes within some spans."""
+    """Return the variance of the change of a Gauss-Markov process within spans: 2 sigma^2 (1 - exp(-span / time))."""
     return np.asarray(-2.0 * sigma_m**2 * np.expm1(-span_s / time_s))
 
 
 def way_of(wheels: TopicData) -> MeasuredMotion | None:
-    """Return the motion by the poses of an odometry itself; None of few."""
+    """Return the motion by the positions of an odometry; None of too few."""
     keep = sane(wheels, np.s_[:2])
     return motion_of_places(wheels.topic, wheels.stamps_ns[keep], wheels.rows[keep, :2]) if len(keep) else None

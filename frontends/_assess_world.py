@@ -15,19 +15,23 @@ from graphloc.frontends._streams import TopicData
 from graphloc.signals.series import interpolated
 from graphloc.time import NS_PER_S
 
-_EXTENT_M = 20.0  # a shorter way does not tell directions
-_SLACK_M = 3.0  # sideways, of an antenna that may be anywhere on the craft
-# From the origin no run goes so far, and coordinates of a map grid (hundreds of km) are farther; a choice.
+_EXTENT_M = 20.0  # a smaller extent of the track does not tell directions
+_SLACK_M = 3.0  # sideways, by which an antenna that may be anywhere on the craft can turn a track
+# No run goes so far from its origin, and coordinates of a map grid (hundreds of km) are larger; a choice.
 _FAR_M = 50e3
-_STANDS = 0.1  # of the fixes' extent: what moves less is not the craft
-_APART_M, _APART = 5.0, 0.02  # largest distance that still fits: metres, share of the extent
+_STANDS = 0.1  # share of the fixes' extent: poses that move by less are not the craft's
+_APART_M, _APART = 5.0, 0.02  # largest distance from the fixes that still fits: m, and as a share of the extent
 
 
 class World(NamedTuple):
-    """Frame of poses: its origin, None if it is not east-north-up or unknown; the evidence in words.
+    """Frame of poses.
 
-    `pose`: whether they may be poses of the vessel about a datum, neither in a map grid nor of something else. `grid`: whether they are as
-    large as in a map grid. `centred`: whether they are as large as from the earth's centre. `ned`: whether they look like north, east, down.
+    Attributes:
+        origin: latitude, longitude (deg) and height (m) of its origin; None if it is unknown, or not east-north-up.
+        why: the evidence in words.
+        pose: whether they may be poses of the vessel about a datum, neither in a map grid nor of something else.
+        grid: whether they are as large as in a map grid. centred: whether they are as large as from the earth's centre.
+        ned: whether they look like north, east, down.
     """
 
     origin: Vec | None
@@ -51,10 +55,10 @@ def _middle_m(poses: TopicData) -> Array:
 
 
 def world_of(poses: TopicData, fixes: ReferenceTrack, antenna_m: Array | None) -> World:
-    """Return the origin of the poses' frame: latitude, longitude, deg, and height, m.
+    """Return the frame of poses, by the GNSS track.
 
     Args:
-        poses: odometry or poses. antenna_m: (3,) in body, if /tf_static has it.
+        poses: odometry or poses. fixes: the track. antenna_m: (3,) its antenna in body; None if tf does not tell it.
     """
     keep = sane(poses, np.s_[:3])
     away_m = float(np.linalg.norm(_middle_m(poses)))
@@ -88,12 +92,12 @@ def world_of(poses: TopicData, fixes: ReferenceTrack, antenna_m: Array | None) -
             f"it moves by {moved:.1f} m while the fixes move by {extent:.0f} m: not a pose of this vessel",
             pose=False,
         )
-    # As complex numbers about their means, p = exp(i turned) q where the frames differ by a turn.
+    # As complex numbers about their means, b = exp(i turned) a if the frames differ by a turn.
     a, b = (v[:, 0] - v[:, 0].mean() + 1j * (v[:, 1] - v[:, 1].mean()) for v in (q, p))
     turned = float(np.degrees(np.angle(np.vdot(a, b))))
     offset = np.median(p - q, axis=0)
     apart = float(np.median(np.hypot(*(p - q - offset)[:, :2].T)))
-    # What the fixes' scatter, and an antenna whose place is not known, can turn a track of this extent by.
+    # By so much, deg, scatter of the fixes and an unknown place of the antenna can turn a track of this extent.
     tolerance = np.degrees((_SLACK_M if antenna_m is None else 1.0) / extent) + 0.2
     largest = max(_APART_M, _APART * extent)
     if abs(turned) > tolerance or apart > largest:

@@ -18,42 +18,44 @@ Stamps = NDArray[np.int64]
 JUMP_LIMIT_S = 60.0
 """A header stamp further than this from its topic's usual latency is a clock jump."""
 HOLE_LIMIT_S = 600.0
-"""Where no sensor says anything for so long, nothing can bridge it: the run falls apart there."""
+"""A time without any message that nothing can bridge: the run is split there."""
 EPOCH_LIMIT_S = 1.0
 """Clocks of two sensors that differ by more are said to disagree."""
 MOST_LATE_S = 1.5
-"""Stamps of a sensor may be off by so much on one clock: a receiver filters its velocity, a driver waits for the rest of a burst."""
+"""Largest delay of a sensor's stamps on one clock: receivers filter their velocity, drivers wait for a whole burst."""
 FARTHEST_LATE_S = 3.0
-"""Those of fixes and velocities by so much, where a radio link or a slow driver holds them up: so far the motion is asked."""
+"""Largest delay of fixes and velocities that is searched by the motion: a radio link or a slow driver holds them up."""
 MOST_ON_ITS_WAY_S = 0.6
-"""A fix is stamped late by no more if all that delays it is its way to the computer."""
+"""Largest delay of a fix that is stamped on arrival and was delayed only on its way to the computer."""
 NO_DATE_NS = 946_684_800 * NS_PER_S
 """2000-01-01: a stamp before it is no date."""
 SCANS_AHEAD_S = 0.15
-"""Scans are stamped later than an IMU's samples that come at once by no more: these may take as long on their way."""
+"""Scans stamped ahead of an IMU by no more may have the same clock: the IMU's samples may be late by as much."""
 LEAP_S = 0.5
-"""By how much a clock may be off that and still be taken for it."""
+"""A step within so much of an expected one, as GPS time minus UTC, is taken for it."""
 GAIN_LIMIT_S = 0.1
 """A clock that gains more on another during a run is said to drift."""
 
 FEWEST_STAMPS = 100
-"""Messages that tell what their clock gains."""
+"""Fewer messages do not tell what their clock gains."""
 
-_WHOLE_S = 0.1  # by which a leap of whole seconds may seem off, as messages take longer or shorter
-_BESIDE, _FEWEST_BESIDE = 20, 10  # messages to either side that tell a leap
-_SOONER = 0.75  # of these: others were delayed
-_ALIKE = 0.7  # of these, that came as soon: not so of two clocks on one topic, nor where hardly two take equally long
-_TENTHS = 10  # of a run
-_EVEN = 0.15  # of the gain, that a clock may be off an even one
-_MOST_DRIFT = 0.1  # of time: beyond, it is none, and the configuration takes none
-_SET_BACK_S = 0.5  # more than samples change places by on their way: a clock was set; a choice
+_WHOLE_S = 0.1  # largest deviation of a leap from whole seconds: latencies vary
+_BESIDE, _FEWEST_BESIDE = 20, 10  # most and fewest messages to either side that tell a leap
+_SOONER = 0.75  # quantile of stamp minus recording time that stands for a side: other messages were delayed
+# Least share of a side's messages near that quantile. It is less of two clocks on one topic, and of scattered
+# latencies.
+_ALIKE = 0.7
+_TENTHS = 10  # parts of a run
+_EVEN = 0.15  # share of the gain by which a clock may deviate from a steady drift, or from a single step
+_MOST_DRIFT = 0.1  # share of time: a larger drift is none, and the configuration takes none
+_SET_BACK_S = 0.5  # a larger step back is a clock that was set, not samples that overtook each other; a choice
 _STEADY = 0.95  # share of messages that are near one of the two levels of a step
-_FOLLOW, _MOST_TRIED = 50, 100  # samples that follow a clock set back; steps that are looked at
-_AT_ONCE, _AFTER_GAP = 0.1, 1.3  # usual steps: within a burst at most, at a gap at least
-_BURSTS = 0.3  # share of samples in bursts, from which they are laid out
-_HOLE = 0.7  # of the IMU's period, to either side: there a sample is missing, as online
-_BEFORE_S = 1.0  # at most, of samples that come after the run's first one and were measured before it
-_IN_ORDER = 0.8  # of those that follow, at the least: others come late
+_FOLLOW, _MOST_TRIED = 50, 100  # samples that must follow where a clock was set back; most places that are tried
+_AT_ONCE, _AFTER_GAP = 0.1, 1.3  # in median steps: the largest within a burst, the least at a gap
+_BURSTS = 0.3  # least share of samples in bursts from which bursts are laid out evenly
+_HOLE = 0.7  # in periods of the IMU: a sample is missing if both neighbours are farther away, as online
+_BEFORE_S = 1.0  # late samples may be so much older than the first one in order
+_IN_ORDER = 0.8  # least share, in order, of the samples after a clock was set back: others come late
 
 
 def usual_latency_s(stamps_ns: Stamps, logs_ns: Stamps) -> float:
@@ -65,9 +67,9 @@ class Gain(NamedTuple):
     """What a clock gains on the recording times.
 
     Attributes:
-        gained_s: from the first tenth of its messages to the last.
-        drift_ppm: by how much it runs faster; 0 where it gains unevenly, or nearly nothing. A clock that is set, or messages that are
-            delayed from some time on, gain in steps.
+        gained_s: gain from the first tenth of its messages to the last.
+        drift_ppm: by how much it runs faster; 0 where it gains unevenly, or nearly nothing. It gains in a step where it
+            is set, or where messages are delayed from some time on.
     """
 
     gained_s: float
@@ -75,15 +77,15 @@ class Gain(NamedTuple):
 
     @property
     def even(self) -> bool:
-        """Whether its drift tells all that it gains."""
+        """Whether the drift explains the whole gain."""
         return self.drift_ppm != 0.0 or abs(self.gained_s) <= GAIN_LIMIT_S
 
 
 def gain(stamps_ns: Stamps, logs_ns: Stamps) -> Gain:
-    """Return what a clock gains on the recording times, by messages of each tenth that were recorded soon: others were delayed.
+    """Return what a clock gains on the recording times; nothing of fewer than `FEWEST_STAMPS` messages.
 
-    The 95 % point, since a few stamps may be wrong; of messages and not of time, since a topic may be silent for long. Few messages
-    tell nothing.
+    Of each tenth of the messages it takes one that was recorded soon, as others were delayed: the 95 % point of stamp
+    minus recording time, since a few stamps may be wrong. Tenths are of messages, since a topic may be silent for long.
     """
     if len(stamps_ns) < FEWEST_STAMPS:
         return Gain(0.0, 0.0)
@@ -97,23 +99,23 @@ def gain(stamps_ns: Stamps, logs_ns: Stamps) -> Gain:
         return Gain(gained_s, 0.0)
     slope, at_start = np.polyfit(t_s, ahead_s, 1)
     uneven_s = float(np.abs(ahead_s - at_start - slope * t_s).max())
-    stands = abs(slope) > _MOST_DRIFT  # or nearly so
+    stands = abs(slope) > _MOST_DRIFT  # stamps that hardly advance, or much too fast, are no drift
     return Gain(gained_s, 0.0 if stands or uneven_s > _EVEN * abs(gained_s) else float(slope) * 1e6)
 
 
 class ClockStep(NamedTuple):
-    """How a clock was set against the recording times: by how much, s, forward positive, and when, recording time, ns."""
+    """How a clock was set against the recording times: by how much, s, positive forward, and at what recording time."""
 
     by_s: float
     at_ns: int
 
     def said(self, whose: str) -> str:
-        """Return it in words, with what to do."""
+        """Return the step in words, with what to do."""
         said = self.what(whose)
         return f"{said}: no time_offset_s holds on both sides, and no bound includes it; take one side (--start, --duration)"
 
     def what(self, whose: str) -> str:
-        """Return it in words."""
+        """Return the step in words."""
         way = "forward" if self.by_s > 0.0 else "back"
         said = f"the clock of {whose} was set {way} by {abs(self.by_s):.2f} s at {utc_text(self.at_ns)}, recording time"
         if abs(abs(self.by_s) - GPS_AHEAD_S) < LEAP_S:
@@ -122,12 +124,12 @@ class ClockStep(NamedTuple):
 
     @property
     def when(self) -> str:
-        """Return when it was, in words."""
+        """When the step was, in words."""
         return f"all of it at {utc_text(self.at_ns)}, recording time"
 
     @property
     def said_of_recorder(self) -> str:
-        """Return it in words, of the clock that makes the recording times."""
+        """The step in words, if the clock is the recorder's."""
         return (
             f"the recorder's clock was set by {self.by_s:+.0f} s at {utc_text(self.at_ns)}, recording time, while the stamps of the headers "
             "go on: these are right on both sides; messages without one are on one side only"
@@ -135,10 +137,10 @@ class ClockStep(NamedTuple):
 
 
 def step(stamps_ns: Stamps, logs_ns: Stamps, least_s: float = EPOCH_LIMIT_S) -> ClockStep | None:
-    """Return the one step in which a clock gains all that it gains on the recording times; None where it gains otherwise, or hardly.
+    """Return the one step that explains the gain of a clock on the recording times; None if none does, or it is small.
 
     Args:
-        least_s: smallest one. By less than the default messages may be delayed as well, from some time on.
+        least_s: smallest step. One smaller than the default may also be messages that are delayed from some time on.
     """
     gained_s = gain(stamps_ns, logs_ns).gained_s
     if abs(gained_s) < least_s:
@@ -156,9 +158,10 @@ def step(stamps_ns: Stamps, logs_ns: Stamps, least_s: float = EPOCH_LIMIT_S) -> 
 
 
 def leaps(stamps_ns: Stamps, logs_ns: Stamps) -> list[tuple[int, ClockStep]]:
-    """Return where (index) and how a clock was set by whole seconds while its messages came evenly: UTC to GPS time, a leap second, an hour.
+    """Return at which indices and how a clock was set by whole seconds: UTC to GPS time, a leap second, an hour.
 
-    Where they do not come evenly they may be late from then on. The recording times tell how many seconds, and so exactly by how much.
+    Only leaps between messages that were recorded evenly are found: else messages may be late from then on. The
+    recording times tell the number of seconds, and rounding gives the exact step.
     """
     if len(stamps_ns) < 2 * _FEWEST_BESIDE:
         return []
@@ -183,10 +186,11 @@ def leaps(stamps_ns: Stamps, logs_ns: Stamps) -> list[tuple[int, ClockStep]]:
 
 
 def without_leaps(stamps_ns: Stamps, logs_ns: Stamps, latency_s: float, whose: str) -> tuple[Stamps, str]:
-    """Return stamps (N,) without the leaps of their clock, and a line that says so; empty where there is none.
+    """Return stamps (N,) without the leaps of their clock, and a warning, '' if there are no leaps.
 
     Args:
-        latency_s: usual one of the IMU. The part of the stamps whose own is nearest to it is kept.
+        latency_s: usual latency of the IMU. The part of the stamps whose latency is nearest to it stays as it is.
+        whose: name of the sensor.
     """
     found = leaps(stamps_ns, logs_ns)
     if not found:
@@ -203,10 +207,10 @@ def without_leaps(stamps_ns: Stamps, logs_ns: Stamps, latency_s: float, whose: s
 
 
 def corrected_ns(stamp_ns: int, config: SensorConfig, elapsed_ns: int) -> int:
-    """Return a stamp with the sensor's `time_offset_s` added, and taken off what its clock has gained.
+    """Return a stamp, ns, with the sensor's `time_offset_s` added and the gain by its `clock_drift_ppm` taken off.
 
     Args:
-        elapsed_ns: from the beginning of the bag until the message was recorded.
+        elapsed_ns: time from the beginning of the bag until the message was recorded.
     """
     return stamp_ns + duration_ns(config.time_offset_s - 1e-6 * config.clock_drift_ppm * elapsed_ns / NS_PER_S)
 
@@ -219,37 +223,45 @@ class Clock(NamedTuple):
 
 
 def reference_of(imu: Clock, others: Iterable[Clock]) -> Clock:
-    """Return the clock that others are compared with: the IMU's; if that counts from its start, the first one that has a date.
+    """Return the clock that others are compared with: the IMU's, or the first that tells a date if it tells none.
 
-    Compared with a clock that counts from its start, the track would be dated 1970.
+    A clock that counts from its start would date the track 1970.
     """
     return next((c for c in (imu, *others) if c.first_ns >= NO_DATE_NS), imu)
 
 
 def behind_s(own: Clock, imu: Clock, reference: Clock) -> float:
-    """Return by how much a clock is behind the reference, s; of a clock that agrees with the IMU's, by how much the IMU's is.
+    """Return by how much a clock is behind the reference, s.
 
-    Messages from one computer have different latencies, and their stamps must not be shifted against each other for that.
+    A clock that agrees with the IMU's is behind by as much as the IMU's: messages from one computer have different
+    latencies, for which their stamps must not be shifted against each other.
     """
     same = abs(own.latency_s - imu.latency_s) <= EPOCH_LIMIT_S
     return (imu if same else own).latency_s - reference.latency_s
 
 
 def most_early_s(own_s: float, imu_s: float) -> float:
-    """Return how much later than it is stamped a message can have been measured, s, by the times from stamps to recording of it and of an IMU.
+    """Return by how much, s, a message can have been measured after its stamp, on the clock of the IMU.
 
-    Not after it was recorded, however it was stamped: on the clock of the IMU, whose samples may be stamped as late as fixes are.
+    However it was stamped, it was measured before it was recorded. The IMU's samples may be stamped late, too.
+
+    Args:
+        own_s, imu_s: usual latencies, recording time minus stamp, of the message's topic and of the IMU.
     """
     return max(own_s - imu_s, 0.0) + MOST_ON_ITS_WAY_S
 
 
 class ScanClock(NamedTuple):
-    """How far a LiDAR's stamps are ahead of the IMU's by the recording times, s: less than it by as much as its scans took longer to come."""
+    """How far a LiDAR's stamps are ahead of the IMU's, s, by the recording times.
+
+    It is the usual latency of the IMU minus that of the scans, so it is too small by what scans take longer on their
+    way.
+    """
 
     ahead_s: float
 
     def said(self, sensor: str, config: AerialConfig) -> str:
-        """Return it in words where it is more than messages take and `stamp_sigma_s` allows for; else empty."""
+        """Return a warning where this is more than latencies and `stamp_sigma_s` explain; else ''."""
         allowed_s = 2.0 * config.stamp_sigma_s
         if -max(MOST_ON_ITS_WAY_S, allowed_s) <= self.ahead_s <= max(SCANS_AHEAD_S, allowed_s):
             return ""
@@ -262,20 +274,20 @@ class ScanClock(NamedTuple):
         )
 
     def astray(self, config: AerialConfig) -> bool:
-        """Whether scans are stamped later than they can have been taken, by more than bounds allow for."""
+        """Return whether scans are stamped later than they can have been taken, by more than bounds allow for."""
         return self.ahead_s > max(SCANS_AHEAD_S, 2.0 * config.stamp_sigma_s)
 
 
 def clock_jumps(stamps_ns: Stamps, logs_ns: Stamps) -> NDArray[np.bool_]:
-    """Return (N,) whether a stamp differs by more than `JUMP_LIMIT_S` from the usual latency of its topic."""
+    """Return (N,) whether the latency of a message is off the usual one of its topic by more than `JUMP_LIMIT_S`."""
     return _unusual(steady_logs(stamps_ns, logs_ns) - stamps_ns)
 
 
 def steady_logs(stamps_ns: Stamps, logs_ns: Stamps) -> Stamps:
-    """Return recording times (N,) as if the recorder's clock had not been set, as it was where they leap while the stamps go on.
+    """Return recording times (N,) as if the recorder's clock had not been set during the run; its last setting counts.
 
-    It is taken to be right at the end. Only where more stamps then are near the usual latency: after a stall, messages are late for a
-    while.
+    It was set where recording times leap while the stamps go on. They are corrected only if more messages then have a
+    latency near the usual one: after a stall, messages are late for a while.
     """
     limit_ns, latency_ns = duration_ns(JUMP_LIMIT_S), logs_ns - stamps_ns
     unusual = int(_unusual(latency_ns).sum())
@@ -288,7 +300,7 @@ def steady_logs(stamps_ns: Stamps, logs_ns: Stamps) -> Stamps:
 
 
 def recorder_set(stamps_ns: Stamps, logs_ns: Stamps) -> ClockStep | None:
-    """Return the largest step by which the recorder's clock was set, as `steady_logs` finds it; None where it was not."""
+    """Return the largest step by which the recorder's clock was set, as `steady_logs` finds it; None if it was not."""
     off_ns = logs_ns - steady_logs(stamps_ns, logs_ns)
     by_ns = np.diff(off_ns)
     if not by_ns.any():
@@ -304,10 +316,10 @@ def _unusual(latency_ns: Stamps) -> NDArray[np.bool_]:
 
 
 def longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
-    """Return (N,) which readings to keep so that as many as possible remain with strictly increasing stamps.
+    """Return (N,) which readings to keep: the longest subsequence with strictly increasing stamps.
 
-    If each stamp only had to be later than the one before, one that jumped ahead would remove all readings until the clock has
-    caught up; this removes that one. Patience sorting, N log N.
+    If each stamp only had to be later than the last kept one, a single jump ahead would remove all readings until the
+    clock has caught up; this removes only the jump. Patience sorting, N log N.
     """
     n = len(stamps_ns)
     if n < 2 or bool((np.diff(stamps_ns) > 0).all()):
@@ -334,13 +346,14 @@ def longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
 
 
 def evened(stamps_ns: Stamps, values: NDArray[np.float64]) -> Stamps:
-    """Return the stamps (N,) of IMU samples, those of bursts laid out evenly; as they are where few samples come in bursts.
+    """Return the stamps (N,) of IMU samples, with bursts laid out evenly; the argument itself if few come in bursts.
 
-    A driver that reads a buffer stamps all that is in it at once. Of a burst, the last sample is as old as its stamp; the others precede
-    it in equal steps since the burst before, after a gap in usual ones. Copies of a sample are no burst.
+    A driver that reads a buffer stamps all its samples at once. The last sample of a burst keeps its stamp. The others
+    precede it in equal steps that fill the time since the burst before; after a gap, in median steps. Copies of a
+    sample are no burst.
 
     Args:
-        stamps_ns: (N,) in order of arrival. values: (N, k).
+        stamps_ns: (N,) in order of arrival. values: (N, k) of the samples.
     """
     if len(stamps_ns) <= 2 * _FOLLOW:
         return stamps_ns
@@ -362,7 +375,7 @@ def evened(stamps_ns: Stamps, values: NDArray[np.float64]) -> Stamps:
 def in_order_or_late(stamps_ns: Stamps) -> NDArray[np.bool_]:
     """Return (N,) which IMU samples to keep: those in order, and late ones that fill a gap.
 
-    A stamp close to another one is a repetition, or from another clock.
+    A late stamp close to another stamp is a repetition, or from another clock.
     """
     keep = longest_increasing(stamps_ns)
     kept, late = stamps_ns[keep], np.flatnonzero(~keep)
@@ -373,7 +386,7 @@ def in_order_or_late(stamps_ns: Stamps) -> NDArray[np.bool_]:
     taken_ns = 0
     for i, n in zip(late.tolist(), np.searchsorted(kept, stamps_ns[late]).tolist(), strict=True):
         stamp_ns = int(stamps_ns[i])
-        # Before the first one in order only what belongs to the run.
+        # Before the first sample in order, only samples little older than it belong to the run.
         before_ns = int(kept[n - 1]) if n else int(kept[0]) - duration_ns(_BEFORE_S)
         if n < len(kept) and min(stamp_ns - max(before_ns, taken_ns), kept[n] - stamp_ns) >= hole_ns:
             keep[i], taken_ns = True, stamp_ns
@@ -381,7 +394,7 @@ def in_order_or_late(stamps_ns: Stamps) -> NDArray[np.bool_]:
 
 
 def set_backs(stamps_ns: Stamps) -> list[int]:
-    """Return the indices at which a clock was set back, in order of arrival: from there on stamps repeat a period already covered.
+    """Return the indices, in order of arrival, from which stamps repeat a period: the clock was set back there.
 
     Samples that were only delayed fill a gap instead.
     """
@@ -403,15 +416,15 @@ def set_backs(stamps_ns: Stamps) -> list[int]:
 def refuse_woven(
     topic: str, stamps_ns: Stamps, logs_ns: Stamps, contents: Sequence[Hashable], files: Sequence[str]
 ) -> None:
-    """Refuse files, or parts of one, that overlap by stamps and recording times, since they cannot be separated.
+    """Refuse files, or parts of one, that overlap by stamps and by recording times, since they cannot be separated.
 
     Copies of the same messages are accepted.
 
     Args:
-        stamps_ns, logs_ns, contents, files: (N,) of an IMU's messages, in order of arrival.
+        topic: of an IMU. stamps_ns, logs_ns, contents, files: (N,) of its messages, in order of arrival.
 
     Raises:
-        InputError: there are such.
+        InputError: files or parts overlap.
     """
     names = list(dict.fromkeys(files))
     if not set_backs(stamps_ns) and len(names) < 2:
@@ -423,7 +436,7 @@ def refuse_woven(
     reached_ns = -1
     for own in of_file.values():
         shared = [key in first for key in own if key[0] <= reached_ns]
-        # A second recorder of the same clock: what it alone has there, the first has lost.
+        # If most messages are shared, a second recorder has the same clock: what it alone has, the first recorder lost.
         again = 2 * sum(shared) > len(shared)
         first |= {key: i for key, i in own.items() if key not in first and not (again and key[0] <= reached_ns)}
         reached_ns = max(stamp_ns for stamp_ns, _ in first)
@@ -440,15 +453,15 @@ def refuse_woven(
 
 
 def refuse_set_back(topic: str, file: str, logs_ns: Stamps) -> None:
-    """Refuse a file whose recording clock was set back: readers sort by time, and so mix both parts.
+    """Refuse a file in which the recorder's clock was set back: readers sort by time, and so mix the two parts.
 
     Duplicated messages are accepted.
 
     Args:
-        logs_ns: (N,) recording times of an IMU's messages, in the order in which they were written.
+        topic, file: of the messages. logs_ns: (N,) recording times of an IMU's messages, in the order of writing.
 
     Raises:
-        InputError: it was.
+        InputError: the clock was set back.
     """
     for k in set_backs(logs_ns):
         after = logs_ns[k:]
@@ -465,7 +478,7 @@ def refuse_set_back(topic: str, file: str, logs_ns: Stamps) -> None:
 
 
 def busiest_section(stamps_ns: Stamps) -> tuple[int, int]:
-    """Return first and last stamp of the section with most readings; gaps of over `HOLE_LIMIT_S` separate sections."""
+    """Return the first and last stamp of the section with most readings; gaps over `HOLE_LIMIT_S` separate sections."""
     ordered = np.sort(stamps_ns)
     cuts = np.flatnonzero(np.diff(ordered) > duration_ns(HOLE_LIMIT_S)) + 1
     section = max(np.split(ordered, cuts), key=len)

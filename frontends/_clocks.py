@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks of sensors against each other, by the recording times: behind or ahead, set during the run, or fast."""
+"""Clocks of sensors against each other, by the recording times: behind or ahead, set during the run, or drifting."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from graphloc.frontends._readings import Readings
 
 
 class _SensorClock(NamedTuple):
-    """A sensor's clock, by the recording times `logs`: what it gains, its usual latency, s, and the step in which it was set, if it was."""
+    """A sensor's clock by the recording times: its gain, its usual latency, s, and the step if it was set.
+
+    `logs` are the recording times (N,), ns, as if the recorder's clock had not been set.
+    """
 
     readings: Readings
     logs: _clock.Stamps
@@ -32,10 +35,13 @@ class _SensorClock(NamedTuple):
 
 
 def clock_warnings(sensors: Sequence[Readings]) -> tuple[list[str], tuple[str, ...]]:
-    """Return a line for each sensor whose clock differs from that of the IMU (or, without one, of the first sensor).
+    """Return a warning on each sensor whose clock differs from the reference: the IMU's or, without an IMU, the first.
 
-    Where a clock was set during the run, a line on that instead, for all whom it concerns: if it is the IMU's, all others. And of these lines
-    those that make all poses doubtful, as no bound includes what they say.
+    Where a clock was set during the run, one warning on the step names all sensors that it concerns: if it is the
+    reference's, all others.
+
+    Returns:
+        The warnings; and the ones of them that make all poses doubtful, as no bound includes the error.
     """
     clocks = [_SensorClock.of(r) for r in sensors if r.stamps_ns]
     if len(clocks) < 2:
@@ -61,7 +67,7 @@ def clock_warnings(sensors: Sequence[Readings]) -> tuple[list[str], tuple[str, .
 
 
 def _epoch_warning(own: _SensorClock, reference: _SensorClock) -> list[str]:
-    """Return a line on a clock that is behind or ahead by more than its time offset, and a message's way, explain."""
+    """Return a warning on a clock that is behind or ahead by more than its time offset and latencies explain."""
     behind_s = own.latency_s - reference.latency_s
     now_s = own.readings.config.time_offset_s
     set_s = now_s - reference.readings.config.time_offset_s
@@ -78,7 +84,7 @@ def _epoch_warning(own: _SensorClock, reference: _SensorClock) -> list[str]:
 
 
 def _gain_warning(own: _SensorClock, reference: _SensorClock, gain_s: float) -> str:
-    """Return a line on a clock that gains on the other: at once, evenly, or otherwise."""
+    """Return a warning on a clock that gains `gain_s` on the reference: in a step, evenly, or otherwise."""
     steps = (_clock.step(c.readings.stamps(), c.logs, _clock.GAIN_LIMIT_S) for c in (own, reference))
     when = next((f", {at.when}" for at in steps if at), "")
     drift_ppm = own.gain.drift_ppm - reference.gain.drift_ppm

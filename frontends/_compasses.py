@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Headings of a bag, beside the gyroscope of its best IMU: how late they are stamped, how they wander, and which repeat another."""
+"""Headings of a bag beside the gyroscope of its best IMU: how late they are, how they wander, which repeat another."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from graphloc.signals.series import runs
 from graphloc.time import NS_PER_S
 
 _NONE: Late = {}
-_FEWEST = 20  # places
-_NO_HEADING_DEG = 20.0  # of wander within a minute, from which the motion tells the heading better; a choice
-_HELD_RAD = np.radians(5.0)  # of a turn, from which no compass says the same
-_OWN_NORTH_DEG = 20.0  # off a quarter turn: more than declination and leeway are in most places
+_FEWEST = 20  # least number of positions
+_NO_HEADING_DEG = 20.0  # wander within a minute from which the motion tells the heading better; a choice
+_HELD_RAD = np.radians(5.0)  # a compass that repeats its heading while the craft turns by more is held
+_OWN_NORTH_DEG = 20.0  # offset from a multiple of 90 deg that is more than declination and leeway in most places
 
 
 class _Heading(NamedTuple):
-    """An orientation that may be a heading; `stream`: with the stamps that the report is of."""
+    """An orientation that may be a heading: its report, and its stream with the stamps to which the report refers."""
 
     report: CompassReport
     stream: TopicData
@@ -48,7 +48,12 @@ class _Heading(NamedTuple):
 def compasses_of(
     bag: Contents, courses: Courses | None, best: Inertial | None, together: Late = _NONE
 ) -> tuple[CompassReport, ...]:
-    """Report every orientation that may be a heading, by the courses and the gyroscope of the best IMU; see `_without_echoes` for their order."""
+    """Report every orientation that may be a heading, in the order of `_without_echoes`.
+
+    Args:
+        bag: what was read. courses: of the fixes; None without fixes. best: the best IMU; None without an IMU.
+        together: how late fixes are, by receiver, for headings of the same messages.
+    """
     turning = None if best is None else best.felt.turning
     candidates = bag.of_type(QUATERNION, IMU, *NUMBERS)
     timed = (_timed(s, courses, turning, together.get(receiver_of(s.topic))) for s in candidates)
@@ -59,9 +64,10 @@ def compasses_of(
 def _timed(
     stream: TopicData, courses: Courses | None, turning: Turning | None, fixes_late_s: tuple[float, float] | None
 ) -> _Heading | None:
-    """Report an orientation, its stamps corrected by what the gyroscope shows; None where it is no heading.
+    """Report an orientation with its stamps corrected by the gyroscope; None if it is none.
 
-    Where that shows nothing, by how late the fixes of the same messages are, unless the gyroscope then denies it.
+    If the gyroscope shows no delay, stamps are corrected by the delay of the fixes of the same messages, unless the
+    gyroscope then shows one.
     """
     report = compass_report(stream, courses, turning)
     if report is None:
@@ -86,7 +92,10 @@ def _timed(
 
 
 def _without_echoes(compasses: Sequence[_Heading]) -> list[_Heading]:
-    """Return the compasses, those of types without a stamp, and of filters, last; one that repeats another names it in `like`."""
+    """Return the headings; one that repeats an earlier one names it in `like`.
+
+    Types without a stamp come last but for filters' outputs.
+    """
     distinct: list[_Heading] = []
     found = []
     for report, stream in sorted(compasses, key=lambda h: (filtered(h.report.topic), h.stream.msgtype in NUMBERS)):
@@ -99,10 +108,10 @@ def _without_echoes(compasses: Sequence[_Heading]) -> list[_Heading]:
 
 
 def _beside_gyro(heading: _Heading, best: Inertial) -> CompassReport:
-    """Return the report with the wander and the number of scattered headings, both relative to the gyroscope of the best IMU.
+    """Return the report with the wander and the number of scattered headings, beside the gyroscope of the best IMU.
 
-    What wanders too far, though on the whole it turns as the gyroscope does, is no heading: a course over ground follows the vessel where it is
-    set, and looks anywhere while it stands. A compass that hangs for a while is one.
+    A heading that wanders too far, though on the whole it turns as the gyroscope does, is a course over ground: it
+    follows the vessel sideways, and is arbitrary at rest. A compass that hangs for a while is still a heading.
     """
     report, stream = heading
     if not report.usable:
@@ -124,7 +133,11 @@ def _beside_gyro(heading: _Heading, best: Inertial) -> CompassReport:
 
 
 def _held(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> NDArray[np.bool_]:
-    """Return (N,) which headings repeat the one before them while the craft turns away from it."""
+    """Return (N,) which headings repeat the preceding one while the craft turns.
+
+    Args:
+        turning: the integrated gyroscope. stamps_ns, angle: (N,), rad.
+    """
     turned = np.interp((stamps_ns - turning.origin_ns) / NS_PER_S, turning.t_s, turning.turned_rad)
     held = np.append(False, np.diff(angle) == 0.0)
     for first, after in runs(held):
@@ -133,10 +146,10 @@ def _held(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> NDArr
 
 
 def with_own_north(compass: CompassReport, imus: Sequence[ImuReport]) -> CompassReport:
-    """Return the report, `drifts` where an IMU's own orientation counts from where it was switched on, as one without a magnetometer does.
+    """Return the report with `drifts`, if it is an IMU's own orientation that counts from where it was switched on.
 
-    Where north is counted from, the course is off its yaw by as much as x of the IMU is turned in the craft, or by a quarter turn more where
-    it counts from north.
+    So does one without a magnetometer. An orientation that knows north is off the course by the yaw of the IMU's mount,
+    up to a multiple of 90 deg, as it may count from east or north.
     """
     own = next((imu for imu in imus if imu.topic == compass.topic), None)
     if own is None or not compass.usable or compass.offset_deg is None or compass.two_antennas:
@@ -147,9 +160,9 @@ def with_own_north(compass: CompassReport, imus: Sequence[ImuReport]) -> Compass
 
 
 def headed(motion: MeasuredMotion, compass: CompassReport, stream: TopicData) -> MeasuredMotion | None:
-    """Return a motion with where the craft heads, by a compass as it is drafted, while that tells; None of a few places.
+    """Return a motion with the attitude by a compass as it is drafted, while it has headings; None of few positions.
 
-    Courses tell it only of a craft that goes ahead, not of a ferry with two bows.
+    Courses tell the heading only of a craft that goes ahead, not of a ferry with two bows.
     """
     late_ns = round(compass.late_s[0] * NS_PER_S) if compass.late_s else 0
     stamps, angle = headings(stream)

@@ -35,11 +35,11 @@ from graphloc.frontends.tags.sightings import IMAGES, INFO
 from graphloc.signals.pauses import common_pauses, pauses_warning
 from graphloc.time import NS_PER_S, seconds_between
 
-_MOST_TRIED = 200  # messages of a topic that cannot be decoded
+_MOST_TRIED = 200  # so many first messages of a topic are tried until one can be decoded
 
 
 class FirstMessage(NamedTuple):
-    """First readable message of a topic: its frame, and recording time minus stamp, s; None: it has no stamp."""
+    """First readable message of a topic: its frame, and recording time minus stamp, s, None if it has no stamp."""
 
     frame: str
     latency_s: float | None
@@ -50,9 +50,12 @@ class Contents:
     """What is read of a bag.
 
     Attributes:
-        source: its name, for messages. topics: by name, from its index.
-        streams: by topic, as recorded. aligned: those with messages, on one clock.
-        tree: of tf. sentences: what NMEA tells beside the streams. lidars, cameras, infos (their CameraInfos): by topic.
+        source: name of the bag, for messages. topics: by name, from its index.
+        streams: by name, with leaps and drift of their clocks corrected. aligned: of these, the ones that have
+            messages, on one clock.
+        tree: of tf. sentences: what NMEA tells beside the streams.
+        lidars, cameras, infos: first messages of clouds, of images and tag lists, and of CameraInfos, by topic.
+        warnings: on the bag, tf and the clocks.
     """
 
     source: str
@@ -71,11 +74,11 @@ class Contents:
         return [stream for stream in self.aligned.values() if stream.msgtype in msgtypes]
 
     def tf_pose(self, stream: TopicData) -> Pose | None:
-        """Return T_body_sensor of a stream where tf connects its frame with the body."""
+        """Return T_body_sensor of a stream; None if tf does not connect its frame with the body."""
         return self.tree.resolve(self.tree.body(), stream.frame_id) if stream.frame_id in self.tree.frames else None
 
     def tf_frame(self, stream: TopicData) -> str | None:
-        """Return the frame of a stream where tf connects it with the body."""
+        """Return the frame of a stream; None if tf does not connect it with the body."""
         return None if self.tf_pose(stream) is None else stream.frame_id
 
 
@@ -83,7 +86,7 @@ def contents_of(bags: Bags | Bag) -> Contents:
     """Read a bag: its topics, streams, transforms, and the first messages of LiDARs and cameras.
 
     Args:
-        bags: as for `read_recording`.
+        bags: see `read_recording`.
 
     Raises:
         InputError: the bag cannot be opened, or its parts overlap in time.
@@ -112,7 +115,7 @@ def contents_of(bags: Bags | Bag) -> Contents:
 
 
 def _topics_of(bag: Bag, msgtypes: Iterable[str]) -> list[str]:
-    """Return the topics of some message types that have messages."""
+    """Return the topics with messages of some types."""
     kinds = set(msgtypes)
     return [t.topic for t in bag.topics.values() if kinds & set(t.msgtypes) and t.messages]
 
@@ -122,7 +125,7 @@ def _imu_of(streams: Sequence[TopicData]) -> TopicData | None:
 
 
 def _steadily_recorded(streams: list[TopicData]) -> tuple[list[TopicData], list[str]]:
-    """Return the streams with recording times that run on where the recorder's clock was set, and a line if it was."""
+    """Return the streams with recording times as if the recorder's clock had not been set, and a warning if it was."""
     recorder = next((at for s in streams if (at := recorder_set(s.stamps_ns, s.logs_ns))), None)
     if recorder is None:
         return streams, []
@@ -130,7 +133,7 @@ def _steadily_recorded(streams: list[TopicData]) -> tuple[list[TopicData], list[
 
 
 def _without_leaps(streams: list[TopicData]) -> tuple[list[TopicData], list[str]]:
-    """Return the streams with stamps put right as they are when the bag is read (`without_leaps`), and a line for each such topic."""
+    """Return the streams without the leaps of their clocks, as when the bag is read, and a warning for each topic."""
     imu = _imu_of(streams)
     if imu is None or leaps(imu.stamps_ns, imu.logs_ns):
         return streams, []
@@ -148,7 +151,7 @@ def _without_leaps(streams: list[TopicData]) -> tuple[list[TopicData], list[str]
 
 
 def _said_of_pauses(streams: Sequence[TopicData]) -> list[str]:
-    """Return a line on pauses that all streams have at once, if there are any."""
+    """Return a warning if all streams pause at once."""
     imu = _imu_of(streams)
     if imu is None:
         return []
@@ -157,10 +160,13 @@ def _said_of_pauses(streams: Sequence[TopicData]) -> list[str]:
 
 
 def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
-    """Return which clocks were set during the run, by topic, unless all were alike: then they are one clock, and what it leaves is a gap."""
+    """Return by topic the step in which its clock was set during the run.
+
+    Empty if all clocks were set alike: then they are one clock, and the step is only a gap.
+    """
     stamped = [s for s in streams if len(s) >= FEWEST_STAMPS and not s.recorded and s.msgtype not in UNSTAMPED]
     steps: dict[str, ClockStep | None] = {}
-    for stream in stamped:  # of what comes on one topic, some may come on one side only
+    for stream in stamped:  # of several streams of a topic, some may have messages on one side of the step only
         topic = bare_topic(stream.topic)
         steps[topic] = steps.get(topic) or step(stream.stamps_ns, stream.logs_ns)
     found = {topic: at for topic, at in steps.items() if at is not None}
@@ -171,7 +177,10 @@ def _clock_steps(streams: Sequence[TopicData]) -> dict[str, ClockStep]:
 
 
 def _as_mostly_set(stream: TopicData, steps: Mapping[str, ClockStep]) -> TopicData:
-    """Return the stream with the stamps of before, or after, its clock was set moved to where most are: else it contradicts itself."""
+    """Return the stream with the step of its clock removed: the side with more messages keeps its stamps.
+
+    Otherwise the stream contradicts itself.
+    """
     at = steps.get(bare_topic(stream.topic))
     if at is None or stream.recorded:
         return stream
@@ -181,13 +190,16 @@ def _as_mostly_set(stream: TopicData, steps: Mapping[str, ClockStep]) -> TopicDa
 
 
 def _pictures(bag: Bag) -> list[str]:
-    """Return the topics of images and tag lists; of a camera that has both kinds of images, the compressed one; no depth images."""
+    """Return the topics of images and tag lists, without depth images.
+
+    Of a camera with raw and compressed images, the compressed ones.
+    """
     every = _topics_of(bag, (*IMAGES, *LISTS))
     return [t for t in every if f"{t}/compressed" not in every and "depth" not in t.lower()]
 
 
 def _firsts_of(bag: Bag, topics: Sequence[str]) -> dict[str, FirstMessage]:
-    """Return what the header says of the first readable message of each topic, if that is among the first 200.
+    """Return by topic what the header of its first readable message says, if it is among the first 200.
 
     Each topic is read separately: a topic without any readable message would otherwise cause all others to be unpacked
     to the end of the bag.

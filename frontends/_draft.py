@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A first `vessel.yaml` from an inspection: it works as it stands, and every guess says that it is one."""
+"""A first `vessel.yaml` from an inspection: it works as it is, and every guess is marked as one."""
 
 from __future__ import annotations
 
@@ -27,20 +27,21 @@ from graphloc.frontends._reports import (
 from graphloc.frontends._turns import WANDERS_DEG
 from graphloc.frontends.decode import IMU, POINT
 
-_MAGNETIC = ("HDG", "HDM")  # ends of names of streams of NMEA
-# Wander of a compass from which it is drafted, and times what is usual: the comparison itself shows 0.6 deg in heavy waves.
+_MAGNETIC = ("HDG", "HDM")  # endings of the names of NMEA streams
+# Wander of a compass from which it is drafted, in deg and as a multiple of the usual one: in heavy waves the comparison
+# with the gyro shows 0.6 deg by itself.
 _WANDER_DEG, _LARGER = 0.7, 1.4
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
 _DRIFTS = (
     10.0,
     600.0,
-)  # wander, deg, and its time, s, of a yaw without a north: cheap ones drift by a degree in half a minute; a choice
-_UNKNOWN_DEG = 10.0  # what a magnetic compass is off by at most coasts, 1 sigma
-_COMPASS_SIGMA_DEG = 2.0  # that the default of a compass's mount offset covers
+)  # wander, deg, and its time constant, s, of a yaw without a north: cheap ones drift 1 deg in half a minute; a choice
+_UNKNOWN_DEG = 10.0  # error of a magnetic compass on most coasts, 1 sigma
+_COMPASS_SIGMA_DEG = 2.0  # an offset up to this is covered by the default of a compass's mount offset
 
 
 def draft_config(inspection: Inspection) -> str:
-    """Return the YAML text of a configuration for this bag. Lines with `# guess:` want a look."""
+    """Return the YAML text of a configuration for a bag. Lines with `# guess:` are to be checked."""
     name = Path(inspection.source.split(", ")[0]).stem or "vessel"
     lines = [
         f"# A first configuration for {inspection.source}, written by `graphloc inspect`.",
@@ -58,7 +59,7 @@ def draft_config(inspection: Inspection) -> str:
 
 
 def _blocks(inspection: Inspection) -> Iterator[list[str]]:
-    """Draft the sensors, in the order in which they matter; a comment stands for what is left out."""
+    """Yield a draft of each sensor, the most important first, and a comment on each topic that is left out."""
     for k, imu in enumerate(inspection.imus):
         yield _imu_block(numbered("imu", k), imu, enabled=k == 0 and not imu.missing)
     yield from receiver_blocks(inspection)
@@ -73,7 +74,7 @@ def _blocks(inspection: Inspection) -> Iterator[list[str]]:
 
 
 def _compass_blocks(compasses: Sequence[CompassReport]) -> Iterator[list[str]]:
-    """Draft the headings, a true one before a magnetic one, a filter's last; of what is none, say why."""
+    """Yield drafts of headings, true before magnetic ones, filters' last; of other orientations, why they are none."""
     usable = (c for c in compasses if c.usable)
     seen: set[str] = set()
     for k, compass in enumerate(sorted(usable, key=lambda c: (filtered(c.topic), c.topic.endswith(_MAGNETIC)))):
@@ -89,7 +90,7 @@ def _compass_blocks(compasses: Sequence[CompassReport]) -> Iterator[list[str]]:
 
 
 def _odometry_blocks(inspection: Inspection) -> Iterator[list[str]]:
-    """Draft wheels and poses, switched off; of what is neither, say why."""
+    """Yield drafts of wheels and poses, switched off; of other odometry, why it is left out."""
     odometry = _other_odometry(inspection)
     speeds = [item for item in odometry if item.role == "check_speed"]
     for item in speeds:
@@ -108,12 +109,12 @@ def _odometry_blocks(inspection: Inspection) -> Iterator[list[str]]:
 
 
 def _other_odometry(inspection: Inspection) -> list[OdometryReport]:
-    """Return odometry and poses but those in a map grid that stand for fixes."""
+    """Return odometry and poses, except those in a map grid that stand for fixes."""
     return [item for item in inspection.odometry if item not in inspection.in_a_grid]
 
 
 def _pose_block(name: str, item: OdometryReport, *, alone: bool) -> list[str]:
-    """Draft poses; `alone`: nothing else tells the place."""
+    """Return a draft of poses; `alone`: nothing else tells the position."""
     measured = "x, y, z" if item.msgtype == POINT else "x, y, z, yaw"
     return [
         f"{name}:",
@@ -127,7 +128,7 @@ def _pose_block(name: str, item: OdometryReport, *, alone: bool) -> list[str]:
 
 
 def _in_body(block: list[str], inspection: Inspection) -> list[str]:
-    """Return the block with its mounts from tf as numbers, where the body of tf has its axes ahead, to starboard, down."""
+    """Return the block with its mounts by tf as numbers, if the axes of tf's body are ahead, to starboard, down."""
 
     def numbers(line: str) -> str:
         head, found, rest = line.partition("mount: {tf_frame: ")
@@ -167,7 +168,7 @@ def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
 
 
 def _mount_sigma_lines(mount: MountGuess) -> list[str]:
-    """A yaw that is no quarter turn is known as well as the motion tells it, which is often worse than the default allows for."""
+    """Return the mount's sigma if its yaw is no multiple of 90 deg: motion often tells it worse than the default."""
     default = ImuConfig().mount_sigma_deg
     if mount.tf_frame is not None or mount.yaw_sigma_deg is None:
         return []
@@ -178,7 +179,7 @@ def _mount_sigma_lines(mount: MountGuess) -> list[str]:
 
 
 def _noise_lines(imu: ImuReport) -> list[str]:
-    """Noise is set only where the bag shows more than the default allows for."""
+    """Return the measured noise as a comment, and as keys where it is more than the default."""
     default = ImuConfig()
     noise = f"{imu.accel_noise_ug:.0f} ug, {imu.gyro_noise_mdps:.1f} mdps per sqrt(Hz)"
     lines = [f"  # measured, worst axis, vibration included: {noise}"]
@@ -212,7 +213,7 @@ def _compass_block(name: str, compass: CompassReport, off: str) -> list[str]:
 
 
 def _error_lines(compass: CompassReport) -> list[str]:
-    """What turns a compass for a while or by the heading: iron, of which two antennas know nothing."""
+    """Return the keys on errors that vary with time or heading: by iron, which does not affect two antennas."""
     wander = compass.wander_deg or 0.0
     gnss = compass.two_antennas and wander < WANDERS_DEG
     usual = 0.2 if gnss else CompassConfig().wander_sigma_deg
@@ -234,7 +235,7 @@ def _error_lines(compass: CompassReport) -> list[str]:
 
 
 def _mount_lines(compass: CompassReport) -> list[str]:
-    """By how much the course says that a compass is turned in the craft, and how well a course tells it."""
+    """Return the mount of a compass by the GNSS course, and how well the course tells it."""
     if compass.offset_deg is None:
         said = "no GNSS course tells it: declination or a mount angle may be included; 1 for a true heading whose mount is known"
         return [f"  mount_offset_sigma_deg: {_UNKNOWN_DEG:.1f}  # guess: {said}"]
@@ -243,7 +244,7 @@ def _mount_lines(compass: CompassReport) -> list[str]:
     if sigma > TURNED_DEG:
         yaw = compass.turned_deg
         sigma = abs(compass.offset_deg - yaw)
-        if yaw % 90.0:  # of a vessel that is set sideways by turns, the mean course is no better than that
+        if yaw % 90.0:  # if a vessel is set to either side by turns, the mean course is no better than its scatter
             sigma = max(_LEEWAY_DEG, compass.scatter_deg or 0.0)
         why = "the course differs from the heading by leeway, so it shows no more than that"
         astern = ", unless the vessel goes astern most of the time: then 0" if compass.backwards else ""
@@ -258,7 +259,7 @@ def _mount_lines(compass: CompassReport) -> list[str]:
 
 
 def _datum_line(inspection: Inspection) -> str:
-    """The datum is where the frame of true or measured poses has its origin; without them any place will do."""
+    """Return the datum: the origin of the frame of true or measured poses. Without poses any place will do."""
     for role in ("truth", "pose"):
         for item in inspection.odometry:
             if item.role == role and item.origin is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lines of a drafted `vessel.yaml` on the clock of a sensor: which stamps are taken, and what is added to them."""
+"""Lines of a drafted `vessel.yaml` on the clock of a sensor: which stamps are used, and what is added to them."""
 
 from __future__ import annotations
 
@@ -28,23 +28,24 @@ from graphloc.frontends._reports import (
 from graphloc.frontends.decode import UNSTAMPED
 from graphloc.time import GPS_AHEAD_S
 
-# Of a velocity that is averaged over seconds: its error lasts as long, and would count as white.
+# Least sigma of a velocity that is averaged over seconds: its error lasts as long, and would count as white.
 _FILTERED_SIGMA_MPS = 1.0
-_OWN_CLOCK_S = 10.0  # no message takes as long
-_FEWEST_STAMPS = 10  # that tell of a clock
-_STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma: a receiver's stamps; recording times instead of these
-# Fixes by NMEA are stamped as much after the times that they tell; those of whole seconds by anything up to a second.
+_OWN_CLOCK_S = 10.0  # no message takes so long: stamps that are off by more are of another clock
+_FEWEST_STAMPS = 10  # messages of a topic that tells of a clock
+_STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma of the delay of a receiver's stamps; of recording times
+# A delay of NMEA stamps after the times in the sentences: least, most, and largest spread. Stamps of whole seconds
+# spread over a second.
 _LEAST_AFTER_S, _MOST_AFTER_S, _EVEN_S = 0.1, 1.0, 0.5
 _STAMPS = "stamps may be late: the delay is estimated with the run; set 0 where the receiver stamps with its own clock"
 _LONG_ON_ITS_WAY = "recorded {:.1f} s after its stamps, which fit what the IMU feels: its messages take as long, and its clock is right"
-# The longest that messages may take; share of that, within which another time is taken for the same.
+# The longest that messages may take; relative difference up to which two delays are equal.
 _LONGEST_WAY_S, _NEAR = 3.0, 0.25
-_ESTIMATED = ("gnss", "gnss_velocity")  # whose delay is, with the run
-_SET = ("imu", "gnss", "gnss_velocity", "body_velocity", "compass")  # whose clocks are set; poses may take their time
+_ESTIMATED = ("gnss", "gnss_velocity")  # kinds whose delay is estimated with the run
+_SET = ("imu", "gnss", "gnss_velocity", "body_velocity", "compass")  # kinds whose clocks are set; poses may come late
 
 
 def with_clock(block: list[str], inspection: Inspection) -> list[str]:
-    """Return the block of a sensor with lines on its clock, where there is anything to say."""
+    """Return the block of a sensor, with lines on its clock if there is anything to say."""
     kind, topic = _value(block, "kind"), _value(block, "topic")
     topics = _by_topic(inspection)
     if topic not in topics:
@@ -54,7 +55,7 @@ def with_clock(block: list[str], inspection: Inspection) -> list[str]:
 
 
 def _by_topic(inspection: Inspection) -> dict[str, TopicReport]:
-    """Return the reports by topic, the last of those that share it: of NMEA a report is of a sentence."""
+    """Return the reports by topic. On an NMEA topic each sentence has a report: the last one is taken."""
     return {bare_topic(t.topic): t for t in inspection.topics}
 
 
@@ -63,7 +64,7 @@ def _value(block: list[str], key: str) -> str:
 
 
 def _stamp_lines(kind: str, own: TopicReport) -> list[str]:
-    """Say where recording times stand for stamps."""
+    """Return the line that recording times are used as stamps, if the headers tell none."""
     if not own.recorded:
         return []
     unknown = "" if kind in _ESTIMATED else ", which no bound includes"
@@ -72,7 +73,7 @@ def _stamp_lines(kind: str, own: TopicReport) -> list[str]:
 
 
 def _drift_lines(own: TopicReport) -> list[str]:
-    """Say how fast a clock drifts, by the recording times."""
+    """Return the line on how fast a clock drifts, by the recording times, if it does."""
     ppm = own.drift_ppm
     if not ppm:
         return []
@@ -85,7 +86,7 @@ def _drift_lines(own: TopicReport) -> list[str]:
 
 
 class _Told(NamedTuple):
-    """What something tells of the stamps of a sensor: what to add to them, s, 1 sigma of what is left, s, and how it tells that."""
+    """A correction of a sensor's stamps: what to add to them, 1 sigma of the remaining error, and the evidence."""
 
     by_s: float
     sigma_s: float
@@ -93,7 +94,7 @@ class _Told(NamedTuple):
 
 
 def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], inspection: Inspection) -> list[str]:
-    """Say what to add to the stamps: where a clock is off by the recording times, or stamps are late by the motion."""
+    """Return lines on what to add to the stamps, by the recording times, the motion, or the times in NMEA sentences."""
     behind = _behind(topic, topics, inspection) if kind in _SET else None
     if behind is None:
         return []
@@ -114,10 +115,10 @@ def _offset_lines(kind: str, topic: str, topics: Mapping[str, TopicReport], insp
 
 
 def _takes_long(behind_s: float, topics: Mapping[str, TopicReport], inspection: Inspection) -> bool:
-    """Return whether messages are recorded so long after their stamps because they take as long, as by radio: the clock is right.
+    """Return whether messages are recorded `behind_s` after their stamps because they take so long, as by radio.
 
-    Recording times cannot tell; what the IMU feels does, of fixes whose stamps are as far off: put right by that time they fit its motion as
-    much too late.
+    Then the clock is right. Recording times cannot tell that, but what the IMU feels can, of fixes that are as far
+    behind: moved by `behind_s`, they are too late for its motion by as much.
     """
     if not EPOCH_LIMIT_S < behind_s <= _LONGEST_WAY_S:
         return False
@@ -129,7 +130,7 @@ def _takes_long(behind_s: float, topics: Mapping[str, TopicReport], inspection: 
 
 
 def _sigma_line(own: TopicReport, told: Sequence[_Told], hinted: tuple[float, float] | None) -> str:
-    """Say how well the delay is known before the run."""
+    """Return the line on how well the delay is known before the run."""
     unstamped = own.recorded or own.msgtype in UNSTAMPED
     sigma_s, said = _ON_ITS_WAY_S if unstamped else _STAMPED_LATE_S, ""
     if told:
@@ -141,7 +142,7 @@ def _sigma_line(own: TopicReport, told: Sequence[_Told], hinted: tuple[float, fl
 
 
 def _hinted(topic: str, inspection: Inspection) -> tuple[float, float] | None:
-    """Return what the IMU hints at that the stamps of a topic of fixes are late by, s, and 1 sigma."""
+    """Return the offset of the stamps of fixes at which the IMU hints, s, and its 1 sigma; None if it does not."""
     return next((r.hinted_s for r in inspection.gnss if bare_topic(r.topic) == topic and r.hinted_s), None)
 
 
@@ -156,7 +157,7 @@ def _by_recording_times(kind: str, behind_s: float, clock: str) -> list[_Told]:
 
 
 def _by_motion(kind: str, topic: str, inspection: Inspection) -> list[_Told]:
-    """Return how late the stamps of a topic are by its motion, or turns; none where these do not tell."""
+    """Return how late the stamps of a topic are, by its motion or turns; empty if these do not tell."""
     reports: dict[str, Sequence[GnssReport | VelocityReport | CompassReport]] = {
         "gnss": inspection.gnss,
         "gnss_velocity": inspection.velocities,
@@ -182,9 +183,10 @@ def _fits(report: GnssReport | VelocityReport | CompassReport) -> str:
 
 
 def _by_sentences(kind: str, topic: str, inspection: Inspection) -> list[_Told]:
-    """Return how long after the times that its fixes tell a topic of NMEA is stamped; none where that is no delay of messages.
+    """Return how long after the times in its sentences an NMEA topic is stamped; empty if that is no delay of messages.
 
-    A computer's clock that nothing sets may be as far off by chance: what the IMU feels is believed rather, even a hint.
+    A computer's clock that nothing sets may be as far off by chance: so what the IMU feels is believed first, even if
+    it is only a hint.
     """
     told = [t.after_s for t in inspection.topics if bare_topic(t.topic) == topic and t.after_s]
     if kind not in _ESTIMATED or not told:
@@ -200,7 +202,7 @@ def _by_sentences(kind: str, topic: str, inspection: Inspection) -> list[_Told]:
 
 
 def clock_lines(inspection: Inspection) -> list[str]:
-    """Say which sensors are stamped by a clock that is not the IMU's."""
+    """Return lines on sensors that are stamped by another clock than the IMU's."""
     topics = _by_topic(inspection)
     named = [imu.topic for imu in inspection.imus] + [gnss.topic for gnss in inspection.gnss]
     named += [twist.topic for twist in inspection.velocities] + [compass.topic for compass in inspection.compasses]
@@ -221,7 +223,10 @@ def clock_lines(inspection: Inspection) -> list[str]:
 
 
 def _behind(topic: str, topics: Mapping[str, TopicReport], inspection: Inspection) -> tuple[float, str] | None:
-    """Return by how much the clock of a topic is behind another, s, by the recording times, and whose that is; None where nothing tells."""
+    """Return by how much the clock of a topic is behind the reference, s, by the recording times, and the name of that.
+
+    None without an IMU, or if the topic has no stamps.
+    """
     clocks = {n: Clock(t.start_ns, t.latency_s[1]) for n, t in topics.items() if t.start_ns is not None and t.latency_s}
     imu = next((clocks[i.topic] for i in inspection.imus if i.topic in clocks), None)
     if imu is None or topic not in clocks:
@@ -232,7 +237,10 @@ def _behind(topic: str, topics: Mapping[str, TopicReport], inspection: Inspectio
 
 
 def scan_clock_lines(inspection: Inspection, lidars: tuple[MountedTopic, ...]) -> list[str]:
-    """Say how far the clocks of LiDARs are off the IMU's, by the recording times; none where they are not, or their stamps are not taken."""
+    """Return lines on how far the clocks of LiDARs are off the IMU's, by the recording times.
+
+    Empty if they are not, or if the IMU's own clock is off. Where recording times replace the stamps, only the sigma.
+    """
     topics = _by_topic(inspection)
     imu_s = next((t.latency_s[1] for i in inspection.imus if (t := topics.get(i.topic)) and t.latency_s), None)
     own_s = [lidar.latency_s for lidar in lidars if lidar.latency_s is not None]
@@ -258,9 +266,10 @@ def scan_clock_lines(inspection: Inspection, lidars: tuple[MountedTopic, ...]) -
 
 
 def recorded_lines(inspection: Inspection, mounted: tuple[MountedTopic, ...]) -> list[str]:
-    """Say that recording times stand for the stamps of scans or images, where these have none, or are of a clock of their own.
+    """Return the line that recording times replace the stamps of scans or images, if these have none or another clock.
 
-    Recording times are on the clock of the IMU, or on that which its stamps are set by, unless all stamps are of another time.
+    Not if all stamps in the bag are far from the recording times: then recording times are not on the IMU's clock
+    either.
     """
     usual = [t.latency_s[1] for t in inspection.topics if t.latency_s and t.count >= _FEWEST_STAMPS]
     if all(abs(latency_s) > EPOCH_LIMIT_S for latency_s in usual):

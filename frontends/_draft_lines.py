@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lines of a drafted `vessel.yaml` that blocks of several sensors have."""
+"""Lines of a drafted `vessel.yaml` that the blocks of several kinds of sensors share."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import json
 from graphloc.frontends._reports import FILTER, WATER, MountGuess, filtered
 from graphloc.frontends._streams import COURSE, HEADING
 
-_ANTENNA_OFF_M = 1.0  # from the IMU: of a car; 4 m on a boat or 0.3 m on a robot are found with it as well
+_ANTENNA_OFF_M = 1.0  # distance from the IMU, as on a car; with it 4 m on a boat or 0.3 m on a robot are found as well
 FILTERED = "by its name, or its messages, a filter's output: it has used the IMU already, and its errors are correlated, so it gets too much weight"
-"""Why a filter's output is not to be fused, or with care."""
+"""Why a filter's output is not fused, or only with care."""
 
 
 def topic_lines(topic: str) -> list[str]:
-    """Return the topic; of NMEA (see `read_streams`) with the sentence that is read."""
+    """Return the lines on the topic of a stream; of NMEA (see `read_streams`) also on the sentences that are read."""
     for beside in (FILTER, COURSE, HEADING, WATER):
         topic = topic.removesuffix(beside)
     name, *sentence = topic.split(" ")
@@ -22,12 +22,12 @@ def topic_lines(topic: str) -> list[str]:
 
 
 def numbered(name: str, k: int) -> str:
-    """Return the name of the k-th sensor of a kind: without a number of the first one."""
+    """Return the name of the k-th sensor of a kind, from 0; the first one has no number."""
     return name if k == 0 else f"{name}_{k + 1}"
 
 
 def mount_line(mount: MountGuess) -> str:
-    """Return the mount of a sensor, with its evidence."""
+    """Return the line on the mount of a sensor, with the evidence."""
     if mount.tf_frame is not None:
         return f"  mount: {{tf_frame: {json.dumps(mount.tf_frame)}}}  # {mount.evidence}"
     rpy = ", ".join(f"{a:.1f}" for a in mount.rpy_deg)
@@ -37,7 +37,12 @@ def mount_line(mount: MountGuess) -> str:
 
 
 def antenna_lines(frame: str | None, evidence: str, keeps_m: float) -> list[str]:
-    """Return where an antenna sits. Of two that keep their distance one is half of it, or more, from anywhere."""
+    """Return the lines on where an antenna is.
+
+    Args:
+        frame: in tf; None if tf does not tell. evidence: of the frame.
+        keeps_m: least distance from another antenna: one of the two is half of it or more from any place.
+    """
     if frame is not None:
         return [f"  mount: {{tf_frame: {json.dumps(frame)}}}  # {evidence}"]
     off_m = max(_ANTENNA_OFF_M, keeps_m / 2.0)
@@ -49,5 +54,5 @@ def antenna_lines(frame: str | None, evidence: str, keeps_m: float) -> list[str]
 
 
 def filtered_lines(topic: str) -> list[str]:
-    """Say that a topic is a filter's output, if it is."""
+    """Return the line that a topic is a filter's output, if it is."""
     return [f"  # guess: {FILTERED}"] if filtered(topic) else []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks of a drafted `vessel.yaml` on receivers: which is used, its antenna, and how large its errors are taken."""
+"""Blocks of a drafted `vessel.yaml` on receivers: which one is used, its antenna, and the size of its errors."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from graphloc.frontends._draft_lines import FILTERED, antenna_lines, filtered_li
 from graphloc.frontends._fixes import NOTHING_M, RTK_SIGMA_M, SCATTERS
 from graphloc.frontends._reports import GnssReport, Inspection, OdometryReport, PartOfFixes, filtered
 
-_RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # not off: else a wrong fix draws the track along
-# For how long the error of a float or single fix stays the same: from where RTK was, its growth is the bound.
+_RTK_SLOW_ERROR = "horizontal_sigma_m: 0.03, vertical_sigma_m: 0.06"  # on: without it a wrong fix draws the track along
+# Correlation time of the error of a float or single fix. After RTK is lost, the growth of this error is the bound.
 _FLOAT_S = 60.0
 _INS = "it tells its speed, as an INS or a filter does: it has used the IMU already, and its errors are correlated, so it gets too much weight"
 _HEIGHT_WANDERS_M = 10.0  # more than a vessel's heave and tide within a run
 
 
 def receiver_blocks(inspection: Inspection) -> Iterator[list[str]]:
-    """Draft the receivers, the first of them enabled; without any, positions in a map grid."""
+    """Yield drafts of the receivers, the first one enabled; without receivers, of positions in a map grid."""
     for k, gnss in enumerate(inspection.gnss):
         yield _gnss_block(numbered("gnss", k), gnss, enabled=k == 0)
         if gnss.by_turns:
@@ -56,7 +56,7 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
         why = f"status gbas (RTK) and less than {RTK_SIGMA_M:g} m" if gnss.by_turns else gnss.why
         lines.append(f"  slow_error: {{{_RTK_SLOW_ERROR}}}  # guess: {why}")
     else:
-        # Left to the default, which is on where a second absolute sensor can tell the error from motion.
+        # Left to the default: on, if a second sensor of position or velocity can tell the error from motion.
         slow_m, large, said = _slow_error(gnss)
         vertical = max(SlowErrorConfig().vertical_sigma_m, gnss.height_range_m / 3.3)
         more = ", ".join([*([f"vertical_sigma_m: {vertical:.1f}"] if wanders else []), *large])
@@ -69,7 +69,11 @@ def _gnss_block(name: str, gnss: GnssReport, *, enabled: bool) -> list[str]:
 
 
 def _never_good(slow_m: float) -> list[str]:
-    """Say that no pose is called good by this receiver alone, where its slow error is so large (m, 1 sigma of an axis)."""
+    """Return a comment if no pose is called good with this receiver alone, as its slow error is large.
+
+    Args:
+        slow_m: the slow error, 1 sigma of an axis.
+    """
     within_m, good_m = math.sqrt(chi2_95(2)) * slow_m, OutputConfig().good_bound_m
     if within_m <= good_m:
         return []
@@ -79,7 +83,7 @@ def _never_good(slow_m: float) -> list[str]:
 
 
 def _other_block(name: str, gnss: GnssReport, others: PartOfFixes, *, enabled: bool) -> list[str]:
-    """The fixes of a receiver while its RTK is gone: as a second sensor, with an error of metres that the RTK does not have."""
+    """Return a draft of a receiver's fixes without RTK: a second sensor, with a slow error that RTK does not have."""
     own, slow_m = _of_part(gnss, others), others.slow_m
     if slow_m >= SlowErrorConfig().horizontal_sigma_m:
         slow_m = max(slow_m, _as_large(own)[0])
@@ -113,7 +117,7 @@ def _grid_block(name: str, item: OdometryReport, *, enabled: bool) -> list[str]:
 
 
 def _of_part(gnss: GnssReport, part: PartOfFixes) -> GnssReport:
-    """Return the report with what a part of the fixes claims and scatters by."""
+    """Return the report with the claimed sigma and the scatter of a part of the fixes."""
     scatter = None if part.white_m is None else (part.white_m, part.white_m, part.white_m)
     return replace(gnss, reported_sigma_m=part.sigma_m, white_m=part.white_m, scatter_m=scatter)
 
@@ -123,9 +127,10 @@ def _wandering(gnss: GnssReport) -> str:
 
 
 def _slow_error(gnss: GnssReport) -> tuple[float, list[str], str]:
-    """Return the horizontal slow error (m), its keys other than by default, and why: as large and fast as wheels or a velocity show.
+    """Return the horizontal slow error (m), its keys that differ from the default, and why.
 
-    Otherwise these contradict the fixes, and what gives way is the heading.
+    It is as large and changes as fast as wheels or a velocity show. Otherwise they contradict the fixes, and the
+    heading gives way.
     """
     default_m = SlowErrorConfig().horizontal_sigma_m
     sigma_m, why = _as_large(gnss)
@@ -138,7 +143,10 @@ def _slow_error(gnss: GnssReport) -> tuple[float, list[str], str]:
 
 
 def _as_large(gnss: GnssReport) -> tuple[float, str]:
-    """Return the sigma of a slow error, m, if larger than by default, and why: another receiver, or what the fixes claim, less what is white."""
+    """Return the sigma of a slow error, m, at least the default, and why, if it is larger.
+
+    It is told by another receiver, or by what the fixes claim if their scatter is far less.
+    """
     claimed_m = max(gnss.reported_sigma_m[:2]) if gnss.reported_sigma_m else 0.0
     white_m = max(gnss.scatter_m[:2]) if gnss.scatter_m else claimed_m
     slow_m = claimed_m if SCATTERS * white_m < claimed_m <= NOTHING_M else 0.0
@@ -151,7 +159,7 @@ def _as_large(gnss: GnssReport) -> tuple[float, str]:
 
 
 def _scatter_lines(gnss: GnssReport) -> list[str]:
-    """What the fixes scatter by, where they claim far less; what they are taken for, where they claim next to nothing."""
+    """Return keys on the noise of the fixes, if they scatter by far more than they claim, or claim a placeholder."""
     default = GnssConfig()
     claimed = max(gnss.reported_sigma_m[:2]) if gnss.reported_sigma_m else default.default_horizontal_sigma_m
     if claimed > NOTHING_M:
@@ -168,7 +176,7 @@ def _scatter_lines(gnss: GnssReport) -> list[str]:
 
 
 def _rtk_lines(gnss: GnssReport) -> list[str]:
-    """What is seen of RTK that reports no covariance, which would count as good to metres."""
+    """Return keys on the noise of RTK that reports no covariance: it would count as good to metres."""
     if gnss.rtk_sigma_m is None or gnss.scatter_m is None:
         return []
     horizontal, vertical = gnss.rtk_sigma_m
@@ -180,7 +188,7 @@ def _rtk_lines(gnss: GnssReport) -> list[str]:
 
 
 def _uneven_lines(gnss: GnssReport) -> list[str]:
-    """What uneven stamps are off by along the way, where that is more than the fixes are taken for."""
+    """Return the least sigma by uneven stamps, if their error along the way is larger than is assumed of the fixes."""
     default = GnssConfig()
     taken_m = gnss.rtk_sigma_m[0] if gnss.rtk_sigma_m else default.default_horizontal_sigma_m
     if gnss.reported_sigma_m:

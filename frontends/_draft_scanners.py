@@ -10,14 +10,14 @@ from graphloc.frontends._draft_clock import recorded_lines, scan_clock_lines
 from graphloc.frontends._draft_lines import numbered
 from graphloc.frontends._reports import Inspection, MountedTopic
 
-_LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px inside in images as they come
-_MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; drivers may publish each packet
-_TURN_S = 0.1  # of a LiDAR: nearly all turn ten times a second
-_MOST_PARTS = 100  # of a submap
+_LISTED_EDGE_PX = 0.3  # AprilTag 3 finds corners 0.3 to 0.5 px too far inside, in images with gamma
+_MOST_TURNS_HZ = 25.0  # LiDARs turn 5 to 20 times a second; if more clouds come, the driver publishes each packet
+_TURN_S = 0.1  # nearly all LiDARs turn ten times a second
+_MOST_PARTS = 100  # most clouds of a submap
 
 
 def scanner_blocks(inspection: Inspection) -> Iterator[list[str]]:
-    """Draft the LiDARs, then the cameras, switched off; of those that are not read, say why."""
+    """Yield drafts of LiDARs, then of cameras, switched off; of topics that are not read, a comment that says why."""
     lidars, cameras = (tuple(m for m in every if not m.left_out) for every in (inspection.lidars, inspection.cameras))
     if lidars:
         block = _aerial_block(lidars, _clouds_hz(inspection, lidars))
@@ -29,7 +29,7 @@ def scanner_blocks(inspection: Inspection) -> Iterator[list[str]]:
 
 
 def _clouds_hz(inspection: Inspection, lidars: tuple[MountedTopic, ...]) -> float:
-    """Return how many clouds a second come of the busiest LiDAR, over the run."""
+    """Return how many clouds a second the busiest LiDAR publishes, over the run."""
     span_s = max((t.span_s for t in inspection.topics if t.span_s is not None), default=0.0)
     counts = {t.topic: t.count for t in inspection.topics}
     return max(counts[lidar.topic] for lidar in lidars) / span_s if span_s > 0.0 else 0.0

@@ -31,7 +31,10 @@ _UNKNOWN_MOUNT = (
 
 
 def velocity_blocks(inspection: Inspection) -> Iterator[list[str]]:
-    """Draft velocities, of which one is used: of two that a device says of itself, neither tells what the other does not."""
+    """Yield drafts of velocities; of those over ground, in world axes, one is used.
+
+    Two velocities of one device repeat each other.
+    """
     gnss = next(iter(inspection.gnss), None)
     known = [v for v in inspection.velocities if v.axes != "unknown"]
     told = [v for v in known if v.axes in (EAST_AXES, NORTH_AXES)] or [
@@ -50,7 +53,7 @@ def velocity_blocks(inspection: Inspection) -> Iterator[list[str]]:
 
 
 def _why_off(twist: VelocityReport, used: VelocityReport | None) -> str | None:
-    """Return why a velocity over ground is switched off; None of the one that is used."""
+    """Return why a velocity over ground is switched off; None if it is the one that is used."""
     if twist.axes is None and twist.msgtype == VECTOR:
         return f"nothing tells that it is a velocity; {twist.why}"
     if twist is used:
@@ -109,7 +112,7 @@ def _velocity_block(name: str, twist: VelocityReport, gnss: GnssReport | None, o
 
 
 def _of_antenna(twist: VelocityReport, gnss: GnssReport | None) -> str | None:
-    """Return what tells that a velocity is of the antenna of a receiver of which nothing tells the place; None: nothing does.
+    """Return the evidence that a velocity is of a receiver's antenna, whose place nothing tells; None if there is none.
 
     A filter's output is of another place than the fixes that went into it.
     """
@@ -122,7 +125,7 @@ def _of_antenna(twist: VelocityReport, gnss: GnssReport | None) -> str | None:
 
 
 def wheels_block(name: str, item: OdometryReport) -> list[str]:
-    """Draft wheels, switched off."""
+    """Return a draft of wheels, switched off."""
     turned = ["  mount: {rpy_deg: [0.0, 0.0, 180.0]}  # guess: its sign looks wrong"] if item.reverse else []
     return [
         f"{name}:", "  kind: body_velocity", f"  topic: {item.topic}",

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Velocities whose east and north are exchanged, beside the motion of the fixes: read in the wrong `convention`, they draw the track kilometres away."""
+"""Velocities with east and north exchanged, by the motion of the fixes.
+
+Read in the wrong `convention`, they draw the track kilometres away.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +17,17 @@ from graphloc.measurements import GnssVelocity
 from graphloc.signals.series import interpolated
 from graphloc.time import NS_PER_S, stamps_of
 
-_HALF_S = 1.0  # of a chord
-_FEWEST = 20  # chords of a craft under way
-_MOVES_MPS = 0.5  # by the chord: over two seconds fixes of 0.3 m tell no direction below; a choice
-_CLEARLY = 0.3  # times what they differ by as they are read
+_HALF_S = 1.0  # half the duration of a chord
+_FEWEST = 20  # least number of chords under way
+_MOVES_MPS = 0.5  # least speed of a chord: below it, fixes of 0.3 m tell no direction in two seconds; a choice
+_CLEARLY = 0.3  # exchanged, velocities must differ by less than this share of the difference as read
 
 
 def exchanged_warnings(sensors: Sequence[Readings], motions: Mapping[str, MeasuredMotion]) -> list[str]:
-    """Return a line for each receiver's velocity that fits the fixes' motion with east and north exchanged, and not as it is read.
+    """Return a warning on each velocity that fits the motion of the fixes only with east and north exchanged.
 
     Args:
-        motions: of the fixes of each receiver; that of most is taken.
+        sensors: what was read. motions: of the fixes of each receiver; the one with most fixes is taken.
     """
     if not motions:
         return []
@@ -44,7 +47,10 @@ def exchanged_warnings(sensors: Sequence[Readings], motions: Mapping[str, Measur
 
 
 def _apart_mps(motion: MeasuredMotion, velocities: Sequence[GnssVelocity]) -> tuple[float, float] | None:
-    """Return by how much velocities differ from chords of a way, m/s, median, as they are and exchanged; None of a craft that hardly moves."""
+    """Return the median differences of velocities from chords of a way, m/s, as read and exchanged.
+
+    None of a craft that hardly moves.
+    """
     assert motion.way_m is not None
     t = (stamps_of(velocities) - motion.origin_ns) / NS_PER_S
     v = np.array([m.v_enu_mps[:2] for m in velocities])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Deficiencies of fixes: positions that a driver repeats, stamps that it truncates or makes as it receives, noise that a receiver understates."""
+"""Deficiencies of fixes: repeated positions, stamps that are truncated or made on arrival, understated noise."""
 
 from __future__ import annotations
 
@@ -16,29 +16,32 @@ from graphloc.signals.white_noise import white_noise_of_thirds
 from graphloc.time import NS_PER_S, stamps_of
 
 _HELD_S = 2.5
-"""A place that is repeated for less, and then changes, was held by a driver; for longer, the receiver itself stands still."""
-_OFTEN, _CUT = 0.2, 0.6  # shares of a sensor's messages, held or at a stamp again, from which a line is due
-_ORIGIN_DEG = 0.1  # about 0, 0
-_AT_ONCE, _BURST_S = 0.1, 0.3  # of the mean step: within a burst; bursts that are closer than that are left alone
-_FAST_S, _SLOW_S, _EVEN, _FEWEST = 0.25, 1.5, 0.2, 100  # steps: motion hides in none, in few, how even, how many tell
-# Of stamps: how even steps are, how many tell, what part of them shows in the places.
+"""A position that is repeated for less, then changes, was held by a driver; for longer, the receiver stands still."""
+_OFTEN, _CUT = 0.2, 0.6  # shares of messages, held, and with repeated stamps or in bursts, from which a warning is due
+_ORIGIN_DEG = 0.1  # positions so near to (0, 0) are a simulator's
+_AT_ONCE, _BURST_S = 0.1, 0.3  # largest step within a burst, as a share of the mean; closer bursts are harmless
+# For the scatter, s: steps below the first hide no motion; above the second they do; largest relative deviation of a
+# step; least number of steps.
+_FAST_S, _SLOW_S, _EVEN, _FEWEST = 0.25, 1.5, 0.2, 100
+# For uneven stamps: largest relative deviation of a step; least number of steps; share of the unevenness that must show
+# in the positions if the stamps are right.
 _STEADY, _ENOUGH, _MEASURED = 0.5, 30, 0.5
-_USUALLY = 90  # percentile of the speed, at which what stamps are off counts
-_UNSTEADY_MPS2 = 4.0  # of slow ones, twice what a craft's acceleration changes by from step to step, most of the time
-_STORED_M, _ANY_MPS = 100.0, 50.0  # how far the first fixes are off the rest, and what no craft's speed is
+_USUALLY = 90  # percentile of the speed at which an error of stamps counts
+_UNSTEADY_MPS2 = 4.0  # of slow fixes: twice the usual change of a craft's acceleration from step to step
+_STORED_M, _ANY_MPS = 100.0, 50.0  # least distance of stored positions from the rest; a speed that no craft has
 STORED = "a position that the receiver had stored: it repeats it from the first fix on, and the next one is far off"
 NOTHING_M = 100.0
-"""1 sigma from which a fix is none."""
+"""Claimed sigma from which a fix is of no use."""
 SCATTERS = 2.0
-"""Scatter over the claim from which the claim is not believed."""
+"""Ratio of scatter to claimed sigma from which the claim is not believed."""
 RTK_SIGMA_M = 0.1
-"""Horizontal, 1 sigma: fixed RTK claims less, float more."""
+"""Horizontal sigma: fixed RTK claims less, float more."""
 
 
 def held(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
-    """Return (N,) which fixes repeat the position of the one before under a new stamp; if that is rare, no fix is marked.
+    """Return (N,) which fixes repeat the preceding position under a new stamp; if that is rare, none.
 
-    Only repetitions before a change count: at rest, a receiver's filter may output one position several times.
+    Only short repetitions that end with a change count: at rest, a receiver's filter may repeat a position for long.
     """
     bad = np.zeros(len(fixes), dtype=bool)
     order = sorted(range(len(fixes)), key=lambda i: (fixes[i].stamp_ns, fixes[i].seq))
@@ -52,10 +55,11 @@ def held(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
 
 
 def stored(stamps_ns: NDArray[np.int64], lla: Array) -> NDArray[np.bool_]:
-    """Return (N,) which fixes of one receiver hold the place where it was when it was last switched off; drivers may say they are fixes.
+    """Return (N,) which fixes of one receiver repeat the position where it was last switched off.
 
-    One place is repeated from the first fix on, the next fix is farther than any craft goes meanwhile, and none comes back. At rest, a
-    receiver that holds its position, or has multipath, jumps by less.
+    Drivers may say that they are fixes. One position is repeated from the first fix on, the next fix is farther than
+    any craft goes meanwhile, and none comes back. At rest, a receiver that holds its position, or has multipath, jumps
+    by less.
 
     Args:
         stamps_ns: (N,), increasing. lla: (N, 3) deg, deg, m, as received.
@@ -72,7 +76,7 @@ def stored(stamps_ns: NDArray[np.int64], lla: Array) -> NDArray[np.bool_]:
 
 
 def stored_warning(sensor: str, lla: Array, bad: NDArray[np.bool_]) -> list[str]:
-    """Return a line on what `stored` found in fixes (N, 3) deg, deg, m."""
+    """Return a warning on what `stored` found in fixes (N, 3), deg, deg, m."""
     if not bad.any():
         return []
     (old, new), count = lla[[0, int(bad.sum())], :2], int(bad.sum())
@@ -81,9 +85,10 @@ def stored_warning(sensor: str, lla: Array, bad: NDArray[np.bool_]) -> list[str]
 
 
 def radians_warning(sensor: str, lla: Array) -> list[str]:
-    """Return a line if all positions (N, 3) lie where coordinates in rad do: a corner of the Gulf of Guinea without land.
+    """Return a warning if all positions (N, 3), deg, deg, m, lie where coordinates in rad do.
 
-    Simulators have their origin at 0, 0.
+    That is a corner of the Gulf of Guinea without land. Positions near (0, 0) are excepted: simulators have their
+    origin there.
     """
     most = np.abs(lla[:, :2]).max(axis=0) if len(lla) else np.zeros(2)
     if most.max() < _ORIGIN_DEG or most[0] > np.pi / 2.0 or most[1] > np.pi:
@@ -96,7 +101,7 @@ def radians_warning(sensor: str, lla: Array) -> list[str]:
 
 
 def held_warning(sensor: str, bad: NDArray[np.bool_]) -> list[str]:
-    """Return a line if a driver repeats positions, as `held` found."""
+    """Return a warning if a driver repeats positions, as `held` found."""
     if not bad.any():
         return []
     said = f"{sensor}: {int(bad.sum())} of {len(bad)} fixes repeat the previous position under a new stamp: the driver "
@@ -104,7 +109,7 @@ def held_warning(sensor: str, bad: NDArray[np.bool_]) -> list[str]:
 
 
 def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
-    """Return a line if stamps (N,) of different measurements are often equal, as a driver truncates them, or come in bursts."""
+    """Return a warning if stamps (N,) of different measurements come in bursts, or are often equal, as if truncated."""
     moments = np.unique(stamps_ns)
     steps_s = np.diff(moments) / NS_PER_S
     if len(moments) > 3 and float((steps_s < _AT_ONCE * steps_s.mean()).mean()) > _CUT:
@@ -124,7 +129,7 @@ def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
 
 
 def height_warning(sensor: str, fixes: Sequence[GnssPosition]) -> list[str]:
-    """Return a line if fixes have no height, or 0 in its place."""
+    """Return a warning if fixes have no height, or 0 instead of one."""
     if len(fixes) >= _FEWEST and all(m.has_height and m.position.height_m == 0.0 for m in fixes):
         said = f"{sensor}: all {len(fixes)} fixes have a height of 0, as of a receiver that gives none"
         return [f"{said}: the track's height is off by what no bound includes; NaN would say so"]
@@ -138,7 +143,7 @@ def height_warning(sensor: str, fixes: Sequence[GnssPosition]) -> list[str]:
 
 
 def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConfig) -> list[str]:
-    """Return a line if fixes scatter by far more than they claim, or claim an uncertainty so large that they are of no use."""
+    """Return a warning if fixes scatter by far more than they claim, or claim so large a sigma as to be useless."""
     if len(fixes) < _FEWEST:
         return []
     ordered = sorted(fixes, key=lambda m: (m.stamp_ns, m.seq))
@@ -159,7 +164,7 @@ def scatter_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConf
 
 
 def uneven_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConfig) -> list[str]:
-    """Return a line if fixes are stamped so unevenly that they are off along the way by far more than they claim."""
+    """Return a warning if fixes are stamped so unevenly that their error along the way is far more than they claim."""
     if len(fixes) < _ENOUGH:
         return []
     moments = {m.stamp_ns: m for m in sorted(fixes, key=lambda m: (m.stamp_ns, m.seq))}
@@ -174,19 +179,19 @@ def uneven_warning(sensor: str, fixes: Sequence[GnssPosition], config: GnssConfi
 
 
 class Uneven(NamedTuple):
-    """By how much stamps of fixes are off even times, s, 1 sigma, and the speed, m/s, at which that counts."""
+    """By how much stamps of fixes are off even times, 1 sigma, and the speed at which that counts."""
 
     stamps_s: float
     speed_mps: float
 
     @property
     def along_m(self) -> float:
-        """What it makes along the way, m, 1 sigma."""
+        """Error of the fixes along the way, m, 1 sigma."""
         return self.stamps_s * self.speed_mps
 
     @property
     def said(self) -> str:
-        """It in words."""
+        """The unevenness in words."""
         return (
             f"stamps are uneven by {self.stamps_s:.3f} s, as of fixes that are stamped when they come in: {self.along_m:.2f} m "
             f"at {self.speed_mps:.1f} m/s"
@@ -194,13 +199,13 @@ class Uneven(NamedTuple):
 
 
 def uneven(stamps_ns: NDArray[np.int64], p_m: Array) -> Uneven | None:
-    """Return how unevenly a receiver's fixes are stamped; None where few tell, or where they were measured when their stamps say so.
+    """Return how unevenly a receiver's fixes are stamped; None of too few, or if the stamps are right.
 
-    A receiver measures at even times. A driver that stamps what comes in adds what each message took, which a speed turns into metres.
-    Stamps that are right though uneven are told by the places: these are as uneven, times the velocity.
+    A receiver measures at even times. A driver that stamps on arrival adds the latency of each message, which the speed
+    turns into metres. Stamps may also be right though uneven: then the positions are as uneven, times the velocity.
 
     Args:
-        stamps_ns: (N,), increasing. p_m: (N, 2) or more columns, east, north.
+        stamps_ns: (N,), increasing. p_m: (N, 2) or more columns, m, east, north.
     """
     t = (stamps_ns - stamps_ns[:1]) / NS_PER_S
     steps = np.diff(t)
@@ -222,7 +227,7 @@ def uneven(stamps_ns: NDArray[np.int64], p_m: Array) -> Uneven | None:
 
 
 def scatter_m(stamps_ns: NDArray[np.int64], p_m: Array) -> float | None:
-    """Return the white noise of positions (N, 2), m, of the worst axis; None if it could be motion."""
+    """Return the white noise of positions (N, 2), m, 1 sigma of the worst axis; None of few, or if it may be motion."""
     steps = np.diff(stamps_ns) / NS_PER_S
     if len(steps) < _FEWEST:
         return None

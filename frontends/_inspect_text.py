@@ -22,8 +22,8 @@ from graphloc.frontends.decode import UNSTAMPED
 from graphloc.plain import aligned
 from graphloc.time import utc_text
 
-_MOST_NAMED = 12  # sentences that are not read
-_MOST_AFTER_S = 60.0  # by which a clock that is set is off
+_MOST_NAMED = 12  # most unread sentences that are named
+_MOST_AFTER_S = 60.0  # a clock that is set is off by less
 # How the draft names an odometry or pose topic, by its role.
 _DRAFTED = {"truth": "truth_topic", "check_speed": "check_speed_topic", "pose": "a sensor of kind pose, switched off"}
 
@@ -70,7 +70,7 @@ def _compass_lines(compass: CompassReport) -> list[str]:
 def _mounted_lines(
     mounted: Sequence[MountedTopic], counts: Mapping[str, int], what: str, kind: str, need: str
 ) -> list[str]:
-    """Return what there is of LiDARs or cameras: how many messages, of `what`, and what a sensor of that `kind` needs to read them."""
+    """Return lines on LiDARs or cameras: their numbers of messages, of `what`, and what a sensor of `kind` needs."""
     if not mounted:
         return []
     lines = [""]

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans in the messages of Livox's drivers, read from their bytes: an object for each of 20 000 points takes a hundred times as long."""
+"""Scans in the messages of Livox's drivers, read from the bytes.
+
+An object for each of 20 000 points would take a hundred times as long.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,10 @@ LIVOX = tuple(
 
 _POINT = (("offset_time", "u4", 6), *((axis, "f4", 7) for axis in "xyz"), ("reflectivity", "u1", 2), ("tag", "u1", 2), ("line", "u1", 2))  # fmt: skip
 _POINT_BYTES = 19
-_PADDED = 3  # bytes at most that a writer leaves behind a message in CDR
-# Of a tag: noise by position, by intensity, and by distortion of near returns; of the Mid-360 low confidence, for glue between objects and for
-# rain. The other two bits are the number of a return, or of the Mid-360 a confidence: they do not tell without the model.
+_PADDED = 3  # most bytes of padding behind a message in CDR
+# Bits of a tag that say noise: by position, by intensity, and by distortion of near returns; for the Mid-360, low
+# confidence because of glue between objects, or of rain. The other two bits are the number of a return or, for the
+# Mid-360, a confidence: without the model they tell nothing.
 _NOISE = 0xCF
 _SAME_CLOCK_NS = NS_PER_S
 
@@ -29,8 +33,8 @@ _SAME_CLOCK_NS = NS_PER_S
 def livox_cloud(data: bytes, *, ros1: bool) -> object:
     """Return a `CustomMsg` as the `PointCloud2` that says the same, without the points whose tag says noise.
 
-    Its stamp is the time of the first point (`timebase`), where that and the header's are on one clock: then the header's may be that
-    of the end of the scan. The field `offset_time` counts from there, ns.
+    Its stamp is the time of the first point (`timebase`), where that and the header's are on one clock: then the
+    header's may be that of the end of the scan. The field `offset_time` counts from there, ns.
 
     Raises:
         ValueError: another number of points than stated, or of bytes than that number takes.
@@ -56,7 +60,12 @@ def livox_cloud(data: bytes, *, ros1: bool) -> object:
 
 
 def _head(data: bytes, *, ros1: bool) -> tuple[tuple[int, str], int, int, int, int, str]:
-    """Return the header's stamp, ns, and frame, timebase, point_num, the number of points, where they begin, and the order of bytes."""
+    """Return what is before the points.
+
+    Returns:
+        The header's stamp, ns, and frame; timebase, ns; point_num; the number of points; the index of their first byte;
+        the byte order.
+    """
     order = "<" if ros1 or data[1] & 1 else ">"
     sec, nanosec, length = struct.unpack_from(f"{order}iII", data, 4)
     at = 16 + length

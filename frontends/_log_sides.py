@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which way y of a log looks, that tells its speed to the side as well: by what the IMU feels there.
+"""Side to which y of a log points, if it also tells a speed along y: by what the IMU feels to the side.
 
-Makers of Doppler logs have x ahead, y to starboard, z down; drivers for ROS turn it to port and up, or do not. Speeds ahead do not tell.
+Makers of Doppler logs have x ahead, y to starboard, z down; drivers for ROS turn y to port and z up, or do not. Speeds
+ahead do not tell.
 
-To the side an IMU feels a = dv_y/dt + w v_x. Over windows, as in `_mount_yaw.py`: what it feels across is fitted by the bends of ways by
-v_x and by v_y, so that the factor of the latter is +1 or -1. What rolls and turns move a log by that sits below or ahead of the IMU, and
-gravity as it rolls, goes as those: a part in proportion to each is fitted with it.
+To the side an IMU feels a = dv_y/dt + w v_x. This is fitted over windows, see `_mount_yaw.py`: what the IMU feels
+across is a combination of the second differences of ways by v_x and by v_y, in which the factor of the latter is +1 or
+-1. A log that is below or ahead of the IMU moves as the vessel rolls and turns, and gravity is felt as she rolls: parts
+in proportion to roll and turn are fitted, too.
 """
 
 from __future__ import annotations
@@ -24,16 +26,21 @@ from graphloc.frontends._streams import TopicData
 from graphloc.signals.series import integral
 from graphloc.time import NS_PER_S
 
-_BLOCK_S = 20.0  # what one is off by differs from the next
-_CLEAR, _BY_CHANCE = 6.0, 1e-4  # sigmas; of Student's t where blocks are few
-# Of a factor that is 1 or -1: else it is no speed of the same craft, or the IMU sits otherwise.
+_BLOCK_S = 20.0  # duration of a block; errors of blocks are independent
+_CLEAR, _BY_CHANCE = 6.0, 1e-4  # least significance, sigmas; probability by Student's t, for few blocks
+# Range of a factor that is 1 or -1. Outside it the speed is not of this craft, or the IMU's mount is wrong.
 _LEAST, _MOST = 0.5, 1.5
-_AHEAD = 2.0  # sigmas, by which the speed ahead goes the right way round turns: an IMU that sits astern has both sides exchanged
-_STILL_MPS = 0.02  # RMS: a log that says less to the side says nothing
+# Least significance, sigmas, of the factor of the speed ahead, which must be positive: of an IMU that is mounted
+# backwards, both sides are exchanged.
+_AHEAD = 2.0
+_STILL_MPS = 0.02  # least RMS of a speed along an axis; a log that says less tells nothing along it
 
 
 def with_side(report: VelocityReport, stream: TopicData, felt: Felt | None) -> VelocityReport:
-    """Return the report of a log with which way its y looks, where it tells a speed to the side, and neither its type nor its name tells that."""
+    """Return the report of a log with the side to which its y points.
+
+    Reports are returned as they are if the log tells no speed along y, or if its type or name tells the side.
+    """
     if report.axes != BODY_AXES or report.mount or report.sideways or report.reverse or not _tells(stream, -2):
         return report
     R = None if report.rpy_deg is None else rotation_from_rpy_deg(np.array(report.rpy_deg))
@@ -44,18 +51,18 @@ def with_side(report: VelocityReport, stream: TopicData, felt: Felt | None) -> V
 
 
 def _tells(stream: TopicData, column: int) -> bool:
-    """Whether velocities tell a speed along an axis at all: one that does not is 0 or NaN there."""
+    """Return whether velocities tell a speed along an axis at all, rather than 0 or NaN."""
     along = stream.rows[sane(stream, np.s_[-3:-2]), column]
     along = along[np.isfinite(along)]
     return len(along) > FEWEST and float(np.sqrt((along**2).mean())) > _STILL_MPS
 
 
 def side_of(felt: Felt, stream: TopicData, R_body_sensor: Array | None = None) -> Side | None:
-    """Return which way y of a log looks whose x looks ahead; None where that is not clear.
+    """Return the side to which y of a log points, whose x points ahead; None if that is not clear.
 
     Args:
-        felt: of an IMU in the axes of the vessel. stream: velocities in its last three columns. R_body_sensor: (3, 3), how its axes are
-            turned by tf.
+        felt: of an IMU in the axes of the vessel. stream: has velocities in its last three columns.
+        R_body_sensor: (3, 3), rotation of its axes by tf.
     """
     keep = sane(stream, np.s_[-3:-1])
     v = np.nan_to_num(stream.rows[keep, -3:])
@@ -71,11 +78,12 @@ def side_of(felt: Felt, stream: TopicData, R_body_sensor: Array | None = None) -
 
 
 def _side_by(felt: Felt, at: Array, ways: list[tuple[Array, NDArray[np.complex128]]], half_s: float) -> Side | None:
-    """Return the same by windows of one length; None where that is not clear.
+    """Return the side by windows of one duration; None if that is not clear.
 
     Args:
-        at: times (M,) of the log, as those of `felt` are counted. ways: times and places of what is felt, of v_x, of v_y, of what a place
-            a metre above moves by, and of one a metre ahead.
+        felt: of the IMU. at: (M,) times of the log, s since the origin of `felt`.
+        ways: times and positions of the felt motion, of the ways by v_x and by v_y, and of the displacements of points
+            a metre above and a metre ahead of the IMU.
     """
     middle = np.arange(max(felt.t_s[0], at[0]) + half_s, min(felt.t_s[-1], at[-1]) - half_s, STEP_S)
     middle = middle[unbroken(at, middle, half_s)]

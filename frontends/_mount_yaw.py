@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Yaw of an IMU's mount in the vessel, from its accelerations and the vessel's motion.
 
-Levelled, with unknown yaw psi, the horizontal acceleration as complex number a = ax + i ay relates to that of the vessel, m,
-forward + i to port, by m = exp(i psi) a. So psi = arg sum(conj(a) m), and |sum| / sqrt(sum |a|^2 sum |m|^2) is the coherence.
+Let a = ax + i ay be the horizontal acceleration in the levelled axes of the IMU, m that of the vessel, forward + i to
+port, and psi the yaw of the mount. Then m = exp(i psi) a, so psi = arg sum(conj(a) m), with the coherence
+|sum(conj(a) m)| / sqrt(sum |a|^2 sum |m|^2).
 """
 
 from __future__ import annotations
@@ -21,26 +22,30 @@ from graphloc.frontends.turning import Turning
 from graphloc.signals.series import integral
 from graphloc.time import NS_PER_S
 
-# Half the time over which an acceleration is asked: short, a car's fits best; longer, waves and the noise of fixes are less.
+# Half the durations of windows for accelerations: in short ones a car's fits best; in long ones waves and the noise of
+# fixes average out.
 HALF_S = (0.5, 1.0, 2.0, 4.0)
-_TIPS_S = 0.25  # half the time over which a roll or pitch is asked
-STEP_S = 0.5  # between two times at which it is asked
-FEWEST, MOVES_M = 20, 1.0  # windows; a shorter way has no direction
-_MIN_COHERENCE, _CLEAR = 0.25, 4.0  # and so many times what chance gives
+_TIPS_S = 0.25  # half the duration of a window for roll and pitch
+STEP_S = 0.5  # between the middles of two windows
+FEWEST, MOVES_M = 20, 1.0  # least number of windows; a shorter chord has no direction
+_MIN_COHERENCE, _CLEAR = 0.25, 4.0  # least coherence of a clear yaw: its value, and as a multiple of chance
 _LIKELY_COHERENCE, _LIKELY = 0.5, 3.0  # the same, to choose between quarter turns: chance gives it once in 8000
-_HINT = 2.0  # the same, to leave a sensor where it is: chance gives it once in 200
-_WAVES_S = 20.0  # the longest that tilt it
-_NEARLY = 0.9  # as long as from one measurement to the next, whose stamps may be uneven
-_AS_COHERENT = 0.9  # at least as the best, nearly: others are full of waves
-_DIFFERS_DEG = 22.5  # of two that are as far off to either side, one is nearer to another quarter turn
-_ASTRAY_DEG = 30.0  # leeway, or an antenna far ahead, make less
+_HINT = 2.0  # multiple of chance to leave a sensor unturned: chance gives it once in 200
+_WAVES_S = 20.0  # period of the longest waves that tilt the vessel
+_NEARLY = 0.9  # half a window is at least this share of the interval of the motion, whose stamps may be uneven
+_AS_COHERENT = 0.9  # share of the best coherence from which another estimate counts: others are full of waves
+_DIFFERS_DEG = 22.5  # estimates that differ by more may be nearer to different quarter turns
+_ASTRAY_DEG = 30.0  # a larger yaw is astray: leeway, or an antenna far ahead, make less
 
 
 @dataclass(frozen=True, slots=True)
 class YawInCraft:
-    """The turn from the craft's forward to the sensor's x, to port, deg; how clear it is, 0 to 1, and what chance makes.
+    """Yaw of a sensor in the craft.
 
-    `differs_deg`: by how much other motions, or accelerations over other times, have it otherwise, where they are as coherent.
+    Attributes:
+        source: of the motion. yaw_deg: from the craft's forward to the sensor's x, positive to port.
+        coherence: how clear it is, 0 to 1. chance: the coherence that chance gives.
+        differs_deg: by how much the yaw differs by other motions or windows that are nearly as coherent, at most.
     """
 
     source: str
@@ -51,42 +56,48 @@ class YawInCraft:
 
     @property
     def agrees(self) -> bool:
-        """Whether the others have it alike, nearly: of a craft that often goes sideways they do not, and its courses tell no quarter turn."""
+        """Whether other motions and windows give nearly the same yaw.
+
+        They do not if a craft often goes sideways: then its courses tell no quarter turn.
+        """
         return self.differs_deg < _DIFFERS_DEG
 
     @property
     def clear(self) -> bool:
-        """Whether chance would not have it."""
+        """Whether the yaw is not by chance."""
         return self.agrees and self.coherence >= max(_MIN_COHERENCE, _CLEAR * self.chance)
 
     @property
     def likely(self) -> bool:
-        """Whether it tells which quarter turn is the likeliest."""
+        """Whether the yaw tells which quarter turn is the likeliest."""
         return self.agrees and self.coherence >= max(_LIKELY_COHERENCE, _LIKELY * self.chance)
 
     @property
     def hints(self) -> bool:
-        """Whether chance seldom has it: not enough to turn a sensor by, but to leave it where it is."""
+        """Whether chance seldom gives the yaw: not enough to turn a sensor by it, but to leave a sensor as it is."""
         return self.coherence >= _HINT * self.chance
 
     @property
     def sigma_deg(self) -> float:
-        """1 sigma of the turn, of a phase of so many windows."""
+        """1 sigma of the yaw, deg, as the phase of independent windows."""
         return float(np.degrees(self.chance * np.sqrt(0.5 * (1.0 - self.coherence**2)) / self.coherence))
 
     @property
     def error_deg(self) -> float:
-        """1 sigma of the turn, as a mount: waves last for many windows, and swing the antenna as well: windows of another length show it."""
+        """1 sigma of the yaw as a mount, deg, with the differences between windows of other durations.
+
+        These show the effect of waves, which last for many windows, and swing the antenna as well.
+        """
         return float(np.hypot(self.sigma_deg, self.differs_deg))
 
     @property
     def astray(self) -> bool:
-        """Whether a sensor that should not be turned is, clearly."""
+        """Whether a sensor that should not be turned clearly is."""
         return self.clear and abs(self.yaw_deg) > max(_ASTRAY_DEG, _CLEAR * self.sigma_deg)
 
     @property
     def said(self) -> str:
-        """What is astray, in words."""
+        """The yaw in words, of a sensor that is astray."""
         return (
             f"what it feels fits how {self.source} moves only turned by {self.yaw_deg:+.0f} deg about the vertical, to port "
             f"(coherence {self.coherence:.2f})"
@@ -95,10 +106,13 @@ class YawInCraft:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Felt:
-    """Motion by a levelled IMU: times (N,), s since `origin_ns`, angle turned, rad, and the double integral of its acceleration.
+    """Motion that a levelled IMU feels.
 
-    The latter is (N,) m, x + i y, in the axes at the begin; in these, too, what a place a metre above the IMU moves by as the craft
-    rolls and pitches, `swing_m` (N,).
+    Attributes:
+        origin_ns, t_s: a stamp; (N,) times since then, s.
+        turned: (N,) integrated yaw rate, rad.
+        way_m: (N,) double integral of the acceleration, m, x + i y in the axes of the IMU at the beginning.
+        swing_m: (N,) displacement, in these axes, of a point 1 m above the IMU as the craft rolls and pitches.
     """
 
     origin_ns: int
@@ -109,17 +123,18 @@ class Felt:
 
     @classmethod
     def of(cls, stamps_ns: NDArray[np.int64], accel: Array, gyro: Array, gravity_mps2: float = 0.0) -> Felt:
-        """Of samples: stamps (N,), increasing; accelerations (N, 3) m/s^2 and rates (N, 3) rad/s, levelled.
+        """Return the motion by samples.
 
         Args:
-            gravity_mps2: what of gravity waves tilt into the horizontal is taken out; 0: nothing.
+            stamps_ns: (N,), increasing. accel, gyro: (N, 3), m/s^2 and rad/s, levelled.
+            gravity_mps2: gravity whose part that waves tilt into the horizontal is removed; 0: nothing is removed.
         """
         t = (stamps_ns - stamps_ns[0]) / NS_PER_S
         turned = integral(t, gyro[:, 2])
         a = accel[:, 0] + 1j * accel[:, 1]
         a = a - np.median(a.real) - 1j * np.median(a.imag)
         swing = integral(t, (gyro[:, 1] - 1j * gyro[:, 0]) * np.exp(1j * turned))
-        # Tilted ahead, an accelerometer feels gravity astern. What lasts longer than waves the gyroscope does not know.
+        # Tilted ahead, an accelerometer feels gravity astern. Tilts that last longer than waves are lost in gyro bias.
         step_s = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
         lately = max(1, round(_WAVES_S / max(step_s, 1e-3)))
         tilt = swing - uniform_filter1d(swing, lately)
@@ -128,21 +143,21 @@ class Felt:
 
     @property
     def turning(self) -> Turning:
-        """How it turned, alone."""
+        """The integrated yaw rate alone."""
         return Turning(self.origin_ns, self.t_s, self.turned)
 
     def times_of(self, motion: MeasuredMotion) -> Array:
-        """A motion's times (M,) as these are counted, s."""
+        """Return a motion's times (M,), s since `origin_ns`."""
         return np.asarray(motion.t_s + (motion.origin_ns - self.origin_ns) / NS_PER_S)
 
 
 def yaw_in_craft(
     stamps_ns: NDArray[np.int64], accel: Array, gyro: Array, motions: Sequence[MeasuredMotion]
 ) -> YawInCraft | None:
-    """Return the clearest estimate over all motions and window lengths; None if no motion is long enough.
+    """Return the clearest yaw over all motions and window durations; None if no motion is long enough.
 
     Args:
-        stamps_ns: (N,), increasing. accel, gyro: (N, 3) m/s^2, rad/s, levelled.
+        stamps_ns: (N,), increasing. accel, gyro: (N, 3), m/s^2 and rad/s, levelled. motions: of the craft.
     """
     felt = Felt.of(stamps_ns, accel, gyro)
     tipped = [found for motion in motions if (found := _yaw_by_tipping(felt, gyro, motion)) and found.clear]
@@ -158,30 +173,35 @@ def yaw_in_craft(
 
 
 def windows_of(motion: MeasuredMotion) -> tuple[float, ...]:
-    """Return half the times, s, over which a motion is asked for its acceleration: none shorter than from one measurement to the next.
+    """Return half the durations, s, of windows for a motion's acceleration, none shorter than its measurement interval.
 
-    Between these it is a straight line, which has no acceleration; asked there, few windows count as many, and what they say as clear.
+    Between measurements the motion is interpolated linearly, without acceleration: few windows would count as many.
     """
     apart_s = float(np.median(np.diff(motion.t_s))) if len(motion.t_s) > 1 else 0.0
     return tuple(half_s for half_s in HALF_S if half_s >= _NEARLY * apart_s) or (apart_s,)
 
 
 def unbroken(times_s: Array, middle_s: Array, half_s: float) -> NDArray[np.bool_]:
-    """Return of which windows (N,) no part lies in a gap of the measurements that is longer than `windows_of` would have it.
+    """Return (N,) which windows do not touch a gap of the measurements that is too long for them, see `windows_of`.
 
-    Across a tunnel a straight line tells nothing of how the craft moved, and as it changes at both ends it fits some motion at some lag.
+    Across a tunnel the interpolation tells nothing of how the craft moved, but its bends at both ends fit some motion
+    at some lag.
+
+    Args:
+        times_s: of the measurements. middle_s: (N,) of the windows. half_s: half their duration.
     """
     apart_s = np.diff(times_s)
-    gap = np.flatnonzero(apart_s > max(half_s / _NEARLY, 2.0 * float(np.median(apart_s))))  # no jitter of a slow sensor
+    gap = np.flatnonzero(apart_s > max(half_s / _NEARLY, 2.0 * float(np.median(apart_s))))  # jitter is no gap
     begins, ends = np.append(times_s[gap], np.inf), np.append(times_s[gap + 1], np.inf)
     return np.asarray(begins[np.searchsorted(ends, middle_s - half_s, side="right")] >= middle_s + half_s)
 
 
 def _yaw_by(felt: Felt, motion: MeasuredMotion, half_s: float) -> YawInCraft | None:
-    """Return the estimate by one motion and one window length.
+    """Return the yaw by one motion and one window duration; None of too few windows.
 
-    Of positions p, p(t + h) - 2 p(t) + p(t - h) gives the mean acceleration about t, and p(t + h) - p(t - h) the course; the
-    sensor gives the same in its own axes at t. h: `half_s`. Poses tell where the craft heads, whatever its course.
+    With h = `half_s` and positions p, p(t + h) - 2 p(t) + p(t - h) is h^2 times the mean acceleration about t, and
+    p(t + h) - p(t - h) the course. The sensor tells the acceleration in its own axes at t. A motion with an attitude
+    tells the heading, whatever its course.
     """
     t, at = felt.t_s, felt.times_of(motion)
     there = np.interp(at, t, felt.turned)
@@ -202,9 +222,10 @@ def _yaw_by(felt: Felt, motion: MeasuredMotion, half_s: float) -> YawInCraft | N
 
 
 def _yaw_by_tipping(felt: Felt, gyro: Array, motion: MeasuredMotion) -> YawInCraft | None:
-    """Return the estimate by how the craft rolls and pitches, by its attitude and by the gyroscope (N, 3), levelled; None of too few.
+    """Return the yaw by roll and pitch: those of the motion's attitude, and those of the levelled gyroscope (N, 3).
 
-    A multirotor leans into its accelerations, so that it feels none along its deck: only its rates tell how a sensor sits.
+    None without an attitude, or of too few windows. A multirotor leans into its accelerations, so it feels none along
+    its deck: only its rates tell the yaw of a sensor.
     """
     t, at = felt.t_s, felt.times_of(motion)
     middle = np.arange(max(t[0], at[0]) + _TIPS_S, min(t[-1], at[-1]) - _TIPS_S, 2.0 * _TIPS_S)
@@ -219,7 +240,11 @@ def _yaw_by_tipping(felt: Felt, gyro: Array, motion: MeasuredMotion) -> YawInCra
 
 
 def _turn_between(source: str, f: NDArray[np.complex128], m: NDArray[np.complex128], windows: float) -> YawInCraft:
-    """Return the turn from what the craft did, m, to what the sensor felt, f, in its own axes, by so many independent windows."""
+    """Return the yaw between what the craft did, m, and what the sensor felt in its own axes, f, with its coherence.
+
+    Args:
+        source: of the motion. f, m: (N,), x + i y. windows: number of independent windows.
+    """
     m, f = m - m.mean(), f - f.mean()
     power = float(np.sqrt((np.abs(f) ** 2).sum() * (np.abs(m) ** 2).sum()))
     product = complex((np.conj(f) * m).sum())
@@ -231,6 +256,10 @@ def _turn_between(source: str, f: NDArray[np.complex128], m: NDArray[np.complex1
 def bent(
     times_s: Array, places: NDArray[np.complex128], middle_s: Array, half_s: float
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Return the second difference of positions about some times, and the first difference over twice the time."""
+    """Return p(t + h) - 2 p(t) + p(t - h) and p(t + h) - p(t - h) of positions p.
+
+    Args:
+        times_s, places: (N,) of p, x + i y. middle_s: (M,) times t. half_s: h.
+    """
     behind, here, ahead = (np.interp(middle_s + k * half_s, times_s, places) for k in (-1, 0, 1))
     return ahead - 2.0 * here + behind, ahead - behind

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of NovAtel.
 
-`novatel_oem7_msgs`, whose statuses are messages of their own; `novatel_msgs`, where they are numbers, without a stamp of ROS;
-`novatel_gps_msgs`, where they are the manual's words.
+`novatel_oem7_msgs`, whose statuses are messages of their own; `novatel_msgs`, where they are numbers, without a stamp
+of ROS; `novatel_gps_msgs`, where they are the manual's words.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _OEM7_NONE: dict[int | str, str] = {
     19: "propagated without observations",
 }
 _OEM7_FIXED = (48, 49, 50)
-_OEM7_INS = (51, 52, 53, 54, 55, 56, 73, 74, 79, 80)  # of a filter; of BESTPOS and BESTVEL too, where that is the best
+_OEM7_INS = (51, 52, 53, 54, 55, 56, 73, 74, 79, 80)  # of a filter; BESTPOS and BESTVEL may have them, too
 _INS_SETTLED, _INS_LEAST = (3, 6, 7), 53
 _OEM7_WHERE = (("lat", "latitude"), ("lon", "longitude"), ("hgt", "height", "altitude"))
 _OEM7_WORDS = {
@@ -51,7 +51,7 @@ _OEM7_WORDS = {
 
 
 def _oem7_code(msg: Any, *names: str) -> int | str:
-    """Return a status or a type of solution as the manual numbers it; a word that is none of those above as it stands."""
+    """Return a status or type of solution by its number in the manual; an unknown word is returned as it is."""
     value = field_of(msg, *names)
     value = getattr(value, "status", getattr(value, "type", value))
     if isinstance(value, str):
@@ -80,7 +80,7 @@ def _oem7_place(msg: Any) -> SaidPlace | Rejection:
 
 
 def _oem7_where(msg: Any, solution: int | str) -> SaidPlace | Rejection:
-    # Heights of INSPVA are above the ellipsoid, and it has no undulation; all others are above the sea.
+    # Heights of INSPVA are above the ellipsoid, without an undulation; all others are above sea level.
     lat, lon, height = (float(field_of(msg, *names)) for names in _OEM7_WHERE)
     north, east, up = (_oem7_sigma(msg, *names) for names in _OEM7_WHERE)
     place = lat, lon, height + float(getattr(msg, "undulation", 0.0))
@@ -88,7 +88,7 @@ def _oem7_where(msg: Any, solution: int | str) -> SaidPlace | Rejection:
 
 
 def _oem7_sigma(msg: Any, *names: str) -> float:
-    """Return the sigma of a field; 0 where the message has none, as INSPVA."""
+    """Return the sigma of a field; 0 if the message has none, as INSPVA."""
     ends = [f"{name}_{end}" for name in names for end in ("stdev", "sigma", "std")]
     return next((float(getattr(msg, name)) for name in ends if hasattr(msg, name)), 0.0)
 
@@ -113,12 +113,12 @@ def _oem7_heading(msg: Any) -> SaidHeading | Rejection:
 
 
 def _ins_type(msg: Any) -> int | str:
-    """Return the type of solution of an INSPVAX; of an INSPVA, which tells none, the least."""
+    """Return the type of solution of an INSPVAX; of an INSPVA, which tells none, the lowest one."""
     return _oem7_type(msg) if hasattr(msg, "pos_type") or hasattr(msg, "position_type") else _INS_LEAST
 
 
 def _ins_trouble(msg: Any) -> Rejection | None:
-    """Return why an INSPVAX, or an INSPVA, which holds less, is no solution."""
+    """Return why an INSPVAX, or an INSPVA, which tells less, has no solution."""
     settled, solution = _oem7_code(msg, "ins_status", "status", "insstatus"), _ins_type(msg)
     if settled in _INS_SETTLED and solution in _OEM7_STATUS:
         return None
@@ -152,7 +152,7 @@ def _oem7_stamp_ns(msg: Any, log_ns: int) -> int | None:
     header = msg.header
     if hasattr(header, "stamp"):
         stamp_ns = int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec)
-    else:  # milliseconds, for all their names
+    else:  # milliseconds, whatever the name
         tow_ms = field_of(header, "gps_week_seconds", "gps_week_milliseconds", "gpssec")
         stamp_ns = week_stamp_ns(int(field_of(header, "gps_week", "week")), int(tow_ms), log_ns)
     age_s = float(getattr(msg, "latency", 0.0))

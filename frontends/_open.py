@@ -157,7 +157,7 @@ def left_beside(opened: Sequence[Opened]) -> list[str]:
 
 
 def _meets(reader: Reader1 | Reader2, other: Path, step: int) -> bool:
-    """Whether another file is recorded right after this one (step 1), or right before it (-1)."""
+    """Return whether another file was recorded right after this one (step 1), or right before it (-1)."""
     try:
         with closing(_open_reader(type(reader), as_ros2(other) or other)) as beside:
             gap_ns = beside.start_time - reader.end_time if step > 0 else reader.start_time - beside.end_time

@@ -22,7 +22,7 @@ _REPORT_EVERY = 2000  # messages between two calls of `progress`
 
 
 class Reader:
-    """One pass over the bag, which gives each message to the sensors and references that read its topic."""
+    """One pass over a bag, which gives each message to the sensors and references that read its topic."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class Reader:
         self._seq = 0
 
     def read(self, progress: Progress | None) -> list[LedgerRow]:
-        """Fill the sensors' readings; return the rows of all other messages."""
+        """Fill the readings of sensors and references; return ledger rows of all messages that give no reading."""
         total = sum(self._topics[t].messages for t in self._wanted)
         read: Counter[str] = Counter()
         for done, raw in enumerate(self._bag.messages(self._wanted), start=1):
@@ -88,7 +88,7 @@ class Reader:
             self._tree.take(raw.msgtype, msg)
 
     def _decode(self, readings: Readings, raw: RawMessage, msg: Any, seq: int) -> None:
-        """Decode a message for a sensor; add a row if it gives no reading."""
+        """Decode a message for a sensor; add a ledger row if it gives no reading."""
         stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns, recorded=readings.config.stamps == "recorded")
         if stamp_ns is None:
             text = f"{raw.file}: header stamp is zero or negative{_when(raw)}: {NO_STAMP}"
@@ -114,7 +114,7 @@ class Reader:
             self._rows.append(readings.row(seq, stamp_ns, value))
 
     def _topic_rows(self, read: Counter[str]) -> list[LedgerRow]:
-        """Return rows for whole topics: unused, read but not fused, or unreadable."""
+        """Return ledger rows of whole topics: unused, read but not fused, or unreadable."""
         rows: list[LedgerRow] = []
 
         def add(topic: str, count: int, outcome: Outcome, reason: str) -> None:
@@ -140,7 +140,7 @@ class Reader:
 
 
 def _when(raw: RawMessage) -> str:
-    """Return the clause that tells a message without a stamp from others."""
+    """Return the clause that identifies a message without a stamp: when it was recorded."""
     return f"{RECORDED_AT}{utc_text(raw.log_ns)}"
 
 

@@ -46,7 +46,13 @@ _Kind = TypeVar("_Kind")
 
 @dataclass(slots=True)
 class Readings:
-    """Columns of one sensor: arrival number, stamp, recording time, decoded value, file."""
+    """Messages of one sensor, as columns of equal length.
+
+    Attributes:
+        sensor, config: its name and configuration.
+        seqs: arrival numbers in the bag. stamps_ns: stamps. logs_ns: recording times. values: decoded messages.
+        files: names of the files that hold the messages.
+    """
 
     sensor: str
     config: SensorConfig
@@ -73,11 +79,11 @@ class Readings:
         return np.array(self.logs_ns, dtype=np.int64)
 
     def of(self, kind: type[_Kind]) -> list[_Kind]:
-        """Return its values of a class, in order."""
+        """Return the values of a class, in order."""
         return [v for v in self.values if isinstance(v, kind)]
 
     def drop(self, bad: NDArray[np.bool_], rejection: Rejection) -> list[LedgerRow]:
-        """Remove readings and return their ledger rows."""
+        """Remove the readings marked in `bad` (N,), in place, and return their ledger rows."""
         rows = [self.row(self.seqs[i], self.stamps_ns[i], rejection) for i in np.flatnonzero(bad)]
         for column in self._columns() if rows else ():
             column[:] = list(compress(column, ~bad))
@@ -105,7 +111,10 @@ class Readings:
 
 
 def right_leaps(sensors: Sequence[Readings], warnings: list[str]) -> None:
-    """Put stamps right where a sensor's clock was set by whole seconds; not where the IMU's was, too: then they are one clock."""
+    """Correct the stamps, in place, of sensors whose clock was set by whole seconds.
+
+    Not if the IMU's clock was set as well: then it may be the same clock.
+    """
     imu = next((r for r in sensors if r.config.kind == "imu" and r.stamps_ns), None)
     if imu is None or _clock.leaps(imu.stamps(), imu.logs()):
         return
@@ -123,7 +132,7 @@ def right_leaps(sensors: Sequence[Readings], warnings: list[str]) -> None:
 
 
 def reject_jumps(sensors: Sequence[Readings], warnings: list[str]) -> list[LedgerRow]:
-    """Drop readings whose stamps left the clock of their topic, or are in another epoch than the run."""
+    """Drop readings whose stamps jump off the clock of their topic, or lie outside the busiest section of the run."""
     rows: list[LedgerRow] = []
     jump = rejected(f"clock jump: the stamp is over {_clock.JUMP_LIMIT_S:.0f} s off its topic's usual latency")
     for readings in sensors:
@@ -142,9 +151,12 @@ def reject_jumps(sensors: Sequence[Readings], warnings: list[str]) -> list[Ledge
 
 
 def reject_set_back(sensors: Sequence[Readings], beside: Sequence[Reference], warnings: list[str]) -> list[LedgerRow]:
-    """Keep the longest part of a run in which the IMU's clock was set back, by recording times, and report where that was.
+    """Keep the longest part of a run in which the IMU's clock was set back, and warn where it was.
 
-    Parts with the same stamps would otherwise be merged.
+    Parts with the same stamps would otherwise be merged. They are cut by the recording times.
+
+    Args:
+        sensors, beside: what was read of the bag; cut in place. warnings: gets the new lines.
 
     Raises:
         InputError: the parts overlap by recording times, too.
@@ -181,10 +193,10 @@ def _drop(readings: Readings, bad: NDArray[np.bool_], rejection: Rejection, warn
 
 
 def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | None, list[LedgerRow]]:
-    """Return the samples in strictly increasing time, late ones in their places, and rows of the messages that are not used.
+    """Return the samples with strictly increasing stamps, late ones sorted in, and ledger rows of unused messages.
 
     Raises:
-        InputError: their rates cannot be rad/s, or accelerations or rates are missing.
+        InputError: rates or accelerations are missing, or cannot be in the configured unit.
     """
     assert isinstance(readings.config, ImuConfig)
     _even_out(readings, warnings)
@@ -211,12 +223,12 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
 
 
 def _imu_values(readings: Readings) -> Array:
-    """Return accelerations and rates (N, 6); of none, (0, 6)."""
+    """Return accelerations and rates (N, 6); (0, 6) if there are none."""
     return np.array([(*v.accel_mps2, *v.gyro_radps) for v in readings.of(ImuReading)]).reshape(-1, 6)
 
 
 def _even_out(readings: Readings, warnings: list[str]) -> None:
-    """Lay out samples that were stamped in bursts evenly."""
+    """Correct the stamps of samples that were stamped in bursts, in place: they are laid out evenly."""
     stamps = readings.stamps()
     even = _clock.evened(stamps, _imu_values(readings))
     if even is not stamps:
@@ -228,7 +240,10 @@ def _even_out(readings: Readings, warnings: list[str]) -> None:
 
 
 def _drop_wrong(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop the repetitions of a frozen IMU, which the solver bridges like a gap, and spikes, which would turn or push the estimate for good."""
+    """Drop repetitions of a frozen IMU and spikes.
+
+    The solver bridges a frozen stretch as a gap. A spike would turn or push the estimate for good.
+    """
     stamps, values = readings.stamps(), _imu_values(readings)
     frozen = frozen_samples(stamps, values)
     warnings += frozen_imu_warning(readings.sensor, stamps, frozen)
@@ -240,7 +255,7 @@ def _drop_wrong(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
 
 
 def reject_repeats(readings: Readings) -> list[LedgerRow]:
-    """Drop messages that repeat a measurement at the same stamp: they are no new evidence."""
+    """Drop messages that repeat the value and the stamp of an earlier one: they are no new evidence."""
     seen: set[tuple[int, object]] = set()
     bad = np.zeros(len(readings.values), dtype=bool)
     for i, (stamp_ns, value) in enumerate(zip(readings.stamps_ns, readings.values, strict=True)):
@@ -251,9 +266,12 @@ def reject_repeats(readings: Readings) -> list[LedgerRow]:
 
 
 def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop fixes that a driver only repeats; warn of that, of truncated or uneven stamps, and of claimed noise that is far too small."""
+    """Drop fixes that a driver only repeats, and warn of them.
+
+    Warn, too, of truncated or uneven stamps, of missing heights, and of claimed noise that is far too small.
+    """
     told = isinstance(readings.config, (GnssConfig, CompassConfig, VelocityConfig, BodyVelocityConfig))
-    if told and not readings.config.takes_turns:  # else its gaps are another sensor's fixes
+    if told and not readings.config.takes_turns:  # else another sensor reads the fixes in its gaps
         warnings += _fixes.stamp_warning(readings.sensor, readings.stamps())
     if not isinstance(readings.config, GnssConfig):
         return []
@@ -268,9 +286,9 @@ def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
 
 
 def thin(readings: Readings) -> list[LedgerRow]:
-    """Drop fixes, velocities and headings that come faster than their errors change: each costs time, and at 500 Hz memory.
+    """Drop measurements that come faster than their errors change: each costs time, and at 500 Hz memory.
 
-    Only what is in order of its stamps is dropped, evenly.
+    They are dropped evenly, and only if their stamps are in order.
     """
     if not readings.config.apart_ns:
         return []
@@ -280,7 +298,7 @@ def thin(readings: Readings) -> list[LedgerRow]:
 
 
 def reject_scattered(imu: ImuSeries | None, readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop headings that are unrelated to their neighbours."""
+    """Drop headings that are unrelated to their neighbours, see `scattered`."""
     if imu is None or not isinstance(readings.config, CompassConfig):
         return []
     bad = scattered(imu, readings.of(CompassHeading))
@@ -305,7 +323,7 @@ def _content(value: Decoded) -> object:
 
 
 def reject_stored(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
-    """Drop the first fixes of a receiver that only says where it was last."""
+    """Drop the first fixes of a receiver that repeats, until it has a position, the one where it was switched off."""
     fixes = [(i, v) for i, v in enumerate(readings.values) if isinstance(v, GnssPosition)]
     fixes.sort(key=lambda pair: (pair[1].stamp_ns, pair[1].seq))
     lla = np.array([v.position for _, v in fixes]).reshape(-1, 3)
@@ -317,7 +335,7 @@ def reject_stored(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
 
 
 def reject_far(readings: Readings, config: VesselConfig, warnings: list[str]) -> list[LedgerRow]:
-    """Drop fixes that are far from all others."""
+    """Drop fixes that are far from all others; warn of positions that look wrong."""
     fixes = readings.of(GnssPosition)
     if not fixes:
         return []
@@ -328,7 +346,7 @@ def reject_far(readings: Readings, config: VesselConfig, warnings: list[str]) ->
 
 
 def reject_far_poses(sensors: Sequence[Readings], warnings: list[str]) -> list[LedgerRow]:
-    """Drop poses far from the datum, in a run with fixes near it: the solver would need minutes and fail."""
+    """Drop poses far from the datum if the run has fixes, which are near it: the solver would take minutes and fail."""
     if not any(isinstance(v, GnssPosition) for readings in sensors for v in readings.values):
         return []
     rows = []

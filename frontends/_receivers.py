@@ -21,10 +21,11 @@ from graphloc.frontends.time_offsets import MotionOffset, later_than
 Late = Mapping[str, tuple[float, float]]
 """How late the stamps of the fixes are, s, and 1 sigma, by receiver (`receiver_of`)."""
 _NONE: Mapping[str, str] = {}
-_FAR_BEYOND = 3.0  # times as far as another one's height wanders
-_SAME_M = 0.05  # by which two topics of one receiver wander against each other at most
-_SAME_WAY_S = 0.1  # within which messages of one device are recorded after their stamps
-# Of the run, from which a receiver is there throughout; of the fixes, from which it says as much as another.
+_FAR_BEYOND = 3.0  # a height that wanders by over so many times the steadiest one's drifts
+_SAME_M = 0.05  # two topics of one receiver wander against each other by no more
+_SAME_WAY_S = 0.1  # latencies of messages of one device differ by less
+# Least share of the longest duration of a receiver that is there throughout, and of the most fixes of one that has as
+# many as others.
 _COVERS = 0.8
 
 
@@ -32,7 +33,7 @@ def receivers_of(bag: Contents, elsewhere: Mapping[str, str] = _NONE) -> list[Gn
     """Report the receivers, the best one first.
 
     Args:
-        elsewhere: why a receiver, by topic, is not of this craft.
+        bag: what was read. elsewhere: by topic, why a receiver is not of this craft.
     """
     found = [r for s in bag.of_type(*FIX_TYPES) if (r := gnss_report(bag.streams[s.topic], bag.tf_frame(s)))]
     found = [replace(r, elsewhere=elsewhere.get(r.topic, "")) for r in found]
@@ -59,20 +60,22 @@ def receivers_of(bag: Contents, elsewhere: Mapping[str, str] = _NONE) -> list[Gn
 
 
 def receiver_of(topic: str) -> str:
-    """Return the receiver of a stream: its topic; of NMEA the talker on it, whose sentences tell one position, with a height or without."""
+    """Return the name of the receiver of a stream: its topic, of NMEA with the talker.
+
+    Sentences of one talker tell one position, with or without a height.
+    """
     name, _, sentence = topic.partition(" ")
     return name if sentence[:1] in ("", "(") else f"{name} {sentence[:2]}"
 
 
 def _octave(gnss: GnssReport, wanders_m: float | None, level_m: float, *, claimed: bool) -> int:
-    """Return how large the fixes' error is by what they claim, or scatter or drift by, in powers of two: closer ones are taken for equal.
+    """Return the size of the fixes' error, by claim, scatter or drift, as the rounded log2 of metres.
 
     Args:
-        wanders_m: by how much the receiver's height wanders, 1 sigma; None where it tells none.
-        level_m: by how much the heights of that receiver wander whose heights wander least, 1 sigma. All ride on one craft: what others
-            wander by far beyond it is their drift, and the horizontal one is half of the vertical. Up to that it may be hills, which
-            receivers smooth.
-        claimed: whether one of the receivers claims anything; where none does, their heights alone compare them.
+        gnss: the receiver. wanders_m: by how much its height wanders, 1 sigma; None if it tells no height.
+        level_m: the same of the receiver whose height wanders least. All receivers ride on one craft: a far larger
+            wander is drift, of which the horizontal one is half. A smaller one may be hills, which receivers smooth.
+        claimed: whether any receiver claims a sigma; if none does, only their heights compare them.
     """
     drift_m = 0.5 * wanders_m if wanders_m is not None and wanders_m > _FAR_BEYOND * level_m else 0.0
     if gnss.reported_sigma_m:
@@ -87,7 +90,7 @@ def _octave(gnss: GnssReport, wanders_m: float | None, level_m: float, *, claime
 
 
 def _beside_others(gnss: GnssReport, rivals: Sequence[GnssReport], bag: Contents) -> GnssReport:
-    """Return the report with by how much it and the other receiver that it agrees with best wander against each other, and how far off others sit."""
+    """Return the report with its wander against the receiver that it agrees with best, and the distance of antennas."""
     beside = {
         other.topic: found
         for other in rivals
@@ -107,11 +110,15 @@ def timed_fixes(
     velocities: Sequence[tuple[TopicData, VelocityReport]],
     streams: Mapping[str, TopicData],
 ) -> GnssReport:
-    """Return the report with how late the fixes' stamps are: by the fixes, or by a velocity over ground that tells it better.
+    """Return the report with how late the fixes' stamps are, by the fixes or a velocity that tells it better.
 
-    A receiver measures both at once. One that is recorded at another time after its stamps is taken for another device. Plotters
-    average course and speed over seconds, and not the place: a velocity that shows the same motion later than the fixes tells nothing of
-    them.
+    A receiver measures fixes and velocity at once. A velocity with another latency is taken for another device's.
+    Plotters average course and speed over seconds, but not the position: a velocity that shows the motion later than
+    the fixes tells nothing of them.
+
+    Args:
+        gnss: the receiver. late: by source, of `motion_time_offsets`. motions: by each source.
+        velocities: streams and reports. streams: all, by name.
     """
     by_topic = {motion.source: motion for motion in motions}
     own_late = late.get(gnss.topic)
@@ -134,13 +141,16 @@ def timed_fixes(
 
 
 def _same_way(fixes: TopicData, velocity: TopicData) -> bool:
-    """Return whether messages are recorded as long after their stamps as the fixes are, as those of one device."""
+    """Return whether the latency of a velocity is that of the fixes, as of one device."""
     latency_s, own_s = (usual_latency_s(s.stamps_ns, s.logs_ns) for s in (fixes, velocity))
     return velocity.recorded == fixes.recorded and abs(own_s - latency_s) < _SAME_WAY_S
 
 
 def timed_velocity(report: VelocityReport, late: MotionOffset | None, together: Late) -> VelocityReport:
-    """Return the report with how late its stamps are: by its motion; where that is not clear, by the fixes of the same messages, unless it denies them."""
+    """Return the report with how late its stamps are, by its motion.
+
+    If that is not clear, by the fixes of the same messages, unless its motion contradicts these.
+    """
     if late is not None and late.clear:
         return replace(report, late_s=late[:2])
     fixes_late_s = together.get(receiver_of(report.topic))
@@ -152,9 +162,12 @@ def timed_velocity(report: VelocityReport, late: MotionOffset | None, together: 
 def with_wander(
     gnss: GnssReport, fixes: TopicData, wheels: Sequence[TopicData], velocities: Sequence[MeasuredMotion]
 ) -> GnssReport:
-    """Return the report with how fast the fixes' error changes, by the first wheels, or velocity, that is no filter's output.
+    """Return the report with how fast the fixes' error changes, by the first wheels or, without wheels, velocities.
 
     A receiver's velocity is by Doppler, on which multipath has little effect.
+
+    Args:
+        gnss, fixes: report and stream of the receiver. wheels, velocities: none of them outputs of a filter.
     """
     rolled = way_of(wheels[0]) if wheels else None
     stamps, p_m, _ = track(fixes)
@@ -170,6 +183,9 @@ def with_wander(
 
 
 def _at_the_time_of(fixes: MeasuredMotion, velocity: MeasuredMotion) -> MeasuredMotion:
-    """Return a velocity's motion with what it shows later than the fixes taken off its times: else braking looks like an error of these."""
+    """Return a velocity's motion, its times corrected by its delay after the fixes.
+
+    Otherwise braking looks like an error of the fixes.
+    """
     later = later_than(fixes, velocity)
     return replace(velocity, t_s=velocity.t_s - later[0]) if later else velocity

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Truncated files (power failure, disk full): read as far as they are intact, without a copy.
 
-A bag's index comes last, so a truncated file has none. `recover` scans the intact records of the file and presents it to rosbags
-as head + intact records + a new end. sqlite3 files do not need this: sqlite3 has a tool of its own (`.recover`).
+A bag's index comes last, so a truncated file has none. `recover` scans the intact records of the file and presents it
+to rosbags as head + intact records + a new end. sqlite3 files do not need this: sqlite3 has a tool of its own
+(`.recover`).
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ class _View(io.RawIOBase):
 
 
 def suffix_of(path: Path) -> str:
-    """Return the suffix of a bag's format: `.bag.active` is what a recorder of ROS 1 leaves that was cut off."""
+    """Return the suffix of a bag's format; a ROS 1 recorder that was cut off leaves `.bag.active`."""
     return ".bag" if path.name.endswith(".bag.active") else path.suffix
 
 
@@ -124,7 +125,7 @@ def recover(path: Path) -> Recovered | None:
 
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
-_MCAP_HEADER_BYTES = 1 << 16  # at most: two words
+_MCAP_HEADER_BYTES = 1 << 16  # most bytes of a header record, which holds two words
 _MCAP_FOOTER, _MCAP_MESSAGE, _MCAP_CHUNK, _MCAP_DATA_END = 0x02, 0x05, 0x06, 0x0F
 
 
@@ -155,7 +156,7 @@ def as_ros2(path: Path) -> Recovered | None:
 
 
 def _ros2_head(path: Path) -> bytes:
-    """Return the first record of an MCAP file, at its length, with profile `ros2`; empty if it has that."""
+    """Return the first record of an MCAP file with profile `ros2`, at unchanged length; empty if that is its profile."""
     with path.open("rb") as file:
         start = file.read(len(_MCAP_MAGIC) + 9)
         if not start.startswith(_MCAP_MAGIC) or len(start) < len(_MCAP_MAGIC) + 9:
@@ -164,7 +165,7 @@ def _ros2_head(path: Path) -> bytes:
         ros2 = struct.pack("<I", 4) + b"ros2"
         if not len(ros2) <= length < _MCAP_HEADER_BYTES or file.read(len(ros2)) == ros2:
             return b""
-    return start + ros2.ljust(length, b"\0")  # nobody reads the rest of it: who wrote the file
+    return start + ros2.ljust(length, b"\0")  # the rest, the name of the writing library, is not read
 
 
 class _Chunk(NamedTuple):
@@ -198,7 +199,7 @@ def _recover_ros1(path: Path) -> Recovered | None:
 
 
 def _intact_chunks(file: BinaryIO, size: int, connections: dict[int, bytes]) -> Iterator[_Chunk]:
-    """Yield the intact chunks of a file of `size` bytes, each when it has been read; collect the connections in them."""
+    """Yield the intact chunks of a file of `size` bytes, each once it has been read; collect their connections."""
     position, needed, counts, times = 0, set[int](), dict[int, int](), list[int]()
     while (at := file.tell()) < size:
         try:
@@ -221,7 +222,7 @@ def _intact_chunks(file: BinaryIO, size: int, connections: dict[int, bytes]) -> 
             if set(counts) == needed:
                 yield _Chunk(position, min(times), max(times), counts)
         else:
-            return  # the index itself: written last, so all chunks are read
+            return  # the index, which is written last: all chunks have been read
 
 
 def _read_chunk(data: bytes, connections: dict[int, bytes]) -> set[int]:

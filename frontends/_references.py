@@ -21,7 +21,14 @@ from graphloc.trajectory import Trajectory
 
 @dataclass(slots=True)
 class Reference:
-    """A topic that is read but not fused; `unstamped`: messages without a stamp, which get their recording times."""
+    """A topic that is read but not fused.
+
+    Attributes:
+        topic, reason: its name; why it is not fused, for the ledger.
+        count, broken: number of messages; of those that cannot be decoded.
+        unstamped: number of messages without a stamp, which get their recording times.
+        stamps_ns, logs_ns, messages: stamps, recording times and contents, as columns.
+    """
 
     topic: str
     reason: str
@@ -33,7 +40,7 @@ class Reference:
     messages: list[Any] = field(default_factory=list)
 
     def keep(self, first_ns: int, last_ns: int) -> None:
-        """Drop messages that were not recorded between two times."""
+        """Drop messages, in place, that were not recorded between two times."""
         kept = [first_ns <= log_ns <= last_ns for log_ns in self.logs_ns]
         columns: tuple[list[Any], ...] = (self.stamps_ns, self.logs_ns, self.messages)
         for column in columns:
@@ -41,7 +48,7 @@ class Reference:
 
 
 def true_trajectory(item: Reference, warnings: list[str]) -> Trajectory | None:
-    """Return the true trajectory, with velocity."""
+    """Return the true trajectory, with velocity; None of fewer than two usable poses. Poses left out give a warning."""
     poses = [(s, *pose_of(m), m) for s, m in zip(item.stamps_ns, item.messages, strict=True)]
     good = [(s, p, R, m) for s, p, R, m in poses if R is not None and (np.abs(p) <= MOST_DISTANCE_M).all()]
     stamps = np.array([s for s, _, _, _ in good], dtype=np.int64)
@@ -59,8 +66,8 @@ def true_trajectory(item: Reference, warnings: list[str]) -> Trajectory | None:
 def _true_velocity(stamps_ns: NDArray[np.int64], p_m: Array, R: Array, messages: Sequence[Any]) -> Array:
     """Return the velocity (N, 3), m/s, in world.
 
-    That is the twist (in the child frame, as in nav_msgs) if it agrees with the positions, else their derivative: some programs
-    write the twist in another frame, or zeros.
+    It is the twist (in the child frame, as in nav_msgs) if it agrees with the derivative of the positions, else this
+    derivative: some programs write the twist in another frame, or zeros.
     """
     derivative = np.gradient(p_m, seconds_since(int(stamps_ns[0]), stamps_ns), axis=0)
     if not all(hasattr(m, "twist") for m in messages):
@@ -76,7 +83,7 @@ def _true_velocity(stamps_ns: NDArray[np.int64], p_m: Array, R: Array, messages:
 
 
 def check_speed(item: Reference) -> SpeedSeries | None:
-    """Return the forward speed of an odometry topic, sorted by stamp."""
+    """Return the forward speeds of an odometry topic, with increasing stamps; None if none is usable."""
     stamps = np.array(item.stamps_ns, dtype=np.int64)
     speed = np.array([float(m.twist.twist.linear.x) for m in item.messages])
     keep = np.flatnonzero(_clock.longest_increasing(stamps))

@@ -14,71 +14,74 @@ from graphloc.frontends.nmea import SPEEDS
 from graphloc.plain import plain
 
 Vec = tuple[float, float, float]
-# HDT and THS of a GNSS receiver; topics of ublox_gps, septentrio_gnss_driver, mavros and their like.
+# Headings by two GNSS antennas: HDT and THS of a GNSS talker; topics of ublox_gps, septentrio_gnss_driver, mavros etc.
 _TWO_ANTENNAS = re.compile(r"[ +]G[A-Z](HDT|THS)$|gps|gnss|nav_?heading|rel_?pos|dual|moving_?bas", re.IGNORECASE)
-# Of MAVROS, microstrain_inertial, robot_localization, xsens_mti: what an EKF makes of receiver and IMU.
+# Outputs of EKFs on receiver and IMU: of MAVROS, microstrain_inertial, robot_localization, xsens_mti.
 _FILTERED = re.compile(r"filter|ekf|ukf|kalman|fused|fusion|local_position|global_position/global$", re.IGNORECASE)
 TURNED_DEG = 10.0
-"""Off the course, from which a compass is taken for turned in the craft."""
-_ASKEW_DEG = 15.0  # off a quarter turn, from which it sits askew
-_ASTERN_DEG = 165.0  # from which a vessel that goes astern explains an offset of its compass as well
-_DIFFERS = 1.5  # times the default of a slow error
-# Horizontal, vertical: less is believed of no receiver that claims nothing; scatter holds no slow error.
+"""Offset from the course from which a compass is taken for turned in the craft."""
+_ASKEW_DEG = 15.0  # deviation from a multiple of 90 deg from which a compass sits askew
+_ASTERN_DEG = 165.0  # offset of a compass from which a vessel that goes astern explains it as well
+_DIFFERS = 1.5  # receivers differ if they wander by more than so many times the default slow error
+# Least horizontal and vertical sigma of RTK that reports no covariance: its scatter holds no slow error.
 _RTK_M = (0.05, 0.1)
 _RTK_SCATTER_M = 0.1  # RTK scatters by less, DGPS, which has the same status, by more; a choice
 FITS_WITH_FIXES = "what the IMU feels fits the motion of the fixes in the same messages"
-"""Why the stamps of a heading, or a velocity, are late, where it does not tell that itself."""
+"""Why the stamps of a heading or velocity are late that the fixes of the same messages tell."""
 WATER = " (through water)"
-"""At the end of the name of a stream of those of a Doppler log's messages that say so."""
+"""Ending of the name of a stream of a Doppler log's velocities through water."""
 FILTER = " (of a filter)"
-"""At the end of the name of a stream whose messages say that a filter made them; see `filtered`."""
+"""Ending of the name of a stream whose messages say that a filter made them; see `filtered`."""
 EAST_AXES, NORTH_AXES, BODY_AXES = "east, north, up", "north, east, down", "forward, left, up (body)"
 STARBOARD_AXES, AHEAD = "forward, right, down (body)", "forward (body), and to a side that nothing shows"
 
 
 def bare_topic(name: str) -> str:
-    """Return the topic of a stream by its name, without the sentence of NMEA, or the kind of message, that the stream is of."""
+    """Return the topic of a stream: its name without the NMEA sentence or the part of a message that it is of."""
     return name.partition(" ")[0]
 
 
 def two_antennas(topic: str) -> bool:
-    """Return whether a heading is one of GNSS, by the name of its topic or its sentence."""
+    """Return whether a heading is by two GNSS antennas, by the name of its topic or its sentence."""
     return bool(_TWO_ANTENNAS.search(topic)) and not filtered(topic)
 
 
 def through_water(topic: str) -> bool:
-    """Return whether a velocity is through the water, by the name of its stream: its sentence of NMEA, or what its messages say."""
+    """Return whether a velocity is through the water, by the name of its stream: its sentence is VHW, or it says so."""
     return topic.endswith(("VHW", WATER))
 
 
 def of_log(topic: str) -> bool:
-    """Return whether a velocity is a log's, along the vessel, by its sentence of NMEA."""
+    """Return whether a velocity is a log's, along the vessel, by its NMEA sentence."""
     return topic.removesuffix(WATER).endswith(SPEEDS)
 
 
 def of_nmea(topic: str) -> bool:
-    """Return whether a place is one of NMEA, by the name of its stream."""
+    """Return whether a place is from NMEA, by the name of its stream."""
     return " " in topic.removesuffix(FILTER)
 
 
 def filtered(topic: str) -> bool:
-    """Return whether a place or velocity is a filter's output, by the name of its topic, or what its messages say."""
+    """Return whether a place, velocity or heading is a filter's output, by the name of its stream."""
     return bool(_FILTERED.search(topic))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TopicReport:
-    """A topic. Stamps are header stamps; None where messages of this type are not unpacked.
+    """A topic, or an NMEA sentence. Stamps are header stamps; None where messages of this type are not unpacked.
 
     Attributes:
-        broken: why the first of the undecodable messages is that; '' where there is none.
-        gaps: intervals longer than 5 usual ones (and 0.1 s); max_gap_s: the longest interval.
-        repeated, backward: stamps equal to, or before, the one before; no_stamp: zero stamps.
-        recorded: whether the headers hold no stamps, or whole seconds only, so that the recording times stand for them here.
-        latency_s: recording time minus header stamp: 5 %, 50 %, 95 % points; without what the clock gains.
+        topic, msgtype, count: name; message type, of a sentence that of the same content; number of messages.
+        undecodable: number of messages that cannot be decoded. broken: why, of the first one; '' if there is none.
+        frame_id: of the first message that names a frame.
+        start_ns, span_s, rate_hz: first stamp; time from the first to the last; 1 / median interval.
+        gaps: number of intervals longer than 5 median ones, and 0.1 s. max_gap_s: the longest interval.
+        repeated, backward: number of stamps equal to, or before, the preceding one. no_stamp: number of zero stamps.
+        recorded: whether the headers hold no stamps, or whole seconds only, so that recording times are used instead.
+        latency_s: recording time minus header stamp, without the drift of the clock: 5 %, 50 %, 95 % points.
         drift_ppm: by how much the clock runs fast, where that is clear; else 0.
-        after_s: of a place by NMEA, how long after the time that it tells it is stamped, or recorded: 5 %, 50 %, 95 % points.
-        unread: of NMEA, the sentences that no sensor reads, by name, the most frequent one first, and how many there are of each.
+        after_s: of a place by NMEA, its stamp or recording time minus the time in the sentence: 5 %, 50 %, 95 % points.
+        unread: of an NMEA topic, the number of sentences that no sensor reads, by name, the most frequent one first.
     """
 
     topic: str
@@ -104,10 +107,13 @@ class TopicReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MountGuess:
-    """Rotation of a sensor in body, deg, or the frame of tf that knows it; and the evidence.
+    """Mount of a sensor in body, and the evidence.
 
-    `xyz_m`: its place, where known. `yaw_told`: whether anything tells its yaw. `yaw_sigma_deg`: how well, 1 sigma, where it is not a
-    quarter turn; else None.
+    Attributes:
+        rpy_deg: roll, pitch, yaw. tf_frame: frame of tf that tells the mount; None if it is not from tf.
+        evidence: in words. xyz_m: its position; None if unknown.
+        yaw_told: whether anything tells its yaw. yaw_sigma_deg: 1 sigma of a yaw that is no multiple of 90 deg; else
+            None.
     """
 
     rpy_deg: Vec
@@ -120,17 +126,18 @@ class MountGuess:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImuReport:
-    """An IMU, in its own axes and in the units of the bag.
+    """An IMU, in its own axes.
 
     Attributes:
-        gravity_size: median size of the acceleration; gravity_axis: its direction, unit vector.
-        accel_unit, gyro_unit, gravity: as `vessel.yaml` has them; why: one line each, where not the standard.
-        still_s: standstill found; gyro_bias_radps is from it (None without).
-        accel_noise_ug, gyro_noise_mdps: noise densities, of the worst axis, at rest or in motion.
-        reported_accel_ug, reported_gyro_mdps: densities that the messages' covariances amount to.
-        fast: whether its rates are in rad/s, by its turns, though by their size deg/s would be likelier.
-        missing: 'rates' or 'accelerations' where all of these are 0: half an IMU, as some drivers publish it; else ''.
-        unfinite: samples that hold NaN.
+        gravity_size: median size of the acceleration, in the unit of the bag. gravity_axis: its direction, unit vector.
+        accel_unit, gyro_unit, gravity: as `vessel.yaml` has them. why: a line on each that is not the standard.
+        still_s: duration of standstill. gyro_bias_radps: mean rate in it; None without standstill.
+        accel_noise_ug, gyro_noise_mdps: noise densities per sqrt(Hz) of the worst axis, at rest or in motion.
+        reported_accel_ug, reported_gyro_mdps: noise densities by the covariances of the messages; None if unknown.
+        mount: in body.
+        fast: whether rates are in rad/s by its turns, though by their size deg/s would be likelier.
+        missing: 'rates' or 'accelerations' where all of these are 0, as some drivers publish half an IMU; else ''.
+        unfinite: number of samples with NaN.
     """
 
     topic: str
@@ -153,7 +160,7 @@ class ImuReport:
 
 
 class Change(NamedTuple):
-    """By how much an error changes within `span_s`: m, 1 sigma of an axis; `seen`: by how many independent values."""
+    """Change of an error within `span_s`: `m`, 1 sigma of an axis, by `seen` independent values."""
 
     span_s: float
     m: float
@@ -161,11 +168,11 @@ class Change(NamedTuple):
 
 
 class PartOfFixes(NamedTuple):
-    """Fixes of a receiver that has RTK at times: those of it, or the others.
+    """Either the RTK fixes or the other fixes of a receiver that has RTK at times.
 
     Attributes:
-        share: of all its fixes. sigma_m: median that they state, east, north, up. white_m: scatter of consecutive ones. slow_m: how large
-            their slow error is taken.
+        share: share of all its fixes. sigma_m: median of the stated sigmas, east, north, up; None if none is stated.
+        white_m: horizontal scatter of consecutive fixes; None if unknown. slow_m: 1 sigma of the slow error to assume.
     """
 
     share: float
@@ -179,22 +186,32 @@ class GnssReport:
     """A GNSS receiver.
 
     Attributes:
-        statuses: fixes by status name; known_covariance: share of fixes that report one.
-        reported_sigma_m: median sigma east, north, up; scatter_m: the white part seen in the data, the same.
-        white_m: the horizontal scatter, where no motion is in it: fixes come fast, or scatter by more than a craft would.
-        spans_s: time from its first fix to its last. late_s: what should be added to its stamps by the accelerometer, and
-            1 sigma; None where that does not tell. late_by: whose motion told so: its own, or that of a velocity of the same device.
-        hinted_s: likewise, where that is likelier than none and not clear. felt_s: the same by the fixes alone, where that is clear; else None.
-        frozen, stored: warning where it repeats one position while the vessel moves, or one of before the run; '' where it does not.
-        in_radians: warning where its positions look like rad; '' where they do not.
-        wander: by how much their error changes along the way, by `wander_by`, wheels or a velocity; empty where these do not tell.
-        uneven: how unevenly its fixes are stamped; None where these tell when each was measured.
-        apart_m: by how much it and `apart_from`, the receiver it agrees with best, wander against each other, 1 sigma of an axis.
-        keeps_m: how far its antenna and that of another receiver are apart at least; 0 where nothing tells.
-        by_turns: the fixes of RTK, by their status and what they state, and the others, where both come.
-        without_place: fixes that state none: NaN, 0, 0, or beyond 90 and 180 deg.
-        without_height: fixes without one. height_range_m: 5 % to 95 % of the height. extent_m: the track's bounding box, east and north.
-        roams_m: diagonal of the box, 10 % to 90 %, of the places. elsewhere: why it is not of this craft, beside another one; '' where it may be.
+        topic, fixes: its stream; number of good fixes. statuses: number of messages by name of their status.
+        known_covariance: share of fixes that report a covariance. reported_sigma_m: median sigma, east, north, up.
+        scatter_m: white noise seen in the data, 1 sigma, east, north, up.
+        white_m: horizontal scatter without motion in it; None unless fixes come fast, or scatter by more than a craft
+            moves.
+        height_range_m: from the 5 % to the 95 % point of the height. extent_m: bounding box of the track, east and
+            north.
+        travelled_m: length of the track. first: latitude, longitude (deg) and height (m) of the first good fix.
+        slow_error: whether it has a slow error of metres, as without RTK. why: the evidence.
+        frame_id, tf_frame: frame of its messages; the same where tf leads to it, else None.
+        frozen, stored: warning if it repeats one position while the vessel moves, or one from before the run; else ''.
+        in_radians: warning if its positions look like rad; else ''.
+        wander: by how much its error changes along the way, by `wander_by`, wheels or a velocity; empty if unknown.
+        without_place: number of fixes without a place: NaN, (0, 0), or beyond 90 and 180 deg.
+        without_height: number of fixes without a height. spans_s: time from its first fix to its last.
+        late_s: what should be added to its stamps by the accelerometer, s, and 1 sigma; None if that is not clear.
+        late_by: whose motion told so: its own, or that of a velocity of the same device.
+        hinted_s: as `late_s`, where an offset is likelier than none but not clear.
+        felt_s: offset by its fixes alone, where that is clear; else None.
+        uneven: how unevenly its fixes are stamped; None where stamps tell when each was measured.
+        apart_m: by how much it and `apart_from`, the receiver that it agrees with best, wander against each other, 1
+            sigma of an axis.
+        keeps_m: least distance of its antenna and that of another receiver; 0 if unknown.
+        by_turns: its RTK fixes, by status and stated sigma, and the others; None unless it has both.
+        roams_m: diagonal of the box from the 10 % to the 90 % points of its positions.
+        elsewhere: why it is not of this craft, beside another receiver; '' if it may be.
     """
 
     topic: str
@@ -234,7 +251,10 @@ class GnssReport:
 
     @property
     def rtk_sigma_m(self) -> tuple[float, float] | None:
-        """Horizontal and vertical sigma that its fixes are taken for, m: of RTK that reports no covariance; None for others. NMEA tells it by its quality."""
+        """Horizontal and vertical sigma to assume of RTK that reports no covariance, m; None of other fixes.
+
+        Also None of NMEA, whose quality tells it.
+        """
         augmented = set(self.statuses) - {"no fix"} == {"gbas"}
         if not augmented or self.reported_sigma_m or self.scatter_m is None or of_nmea(self.topic):
             return None
@@ -243,7 +263,7 @@ class GnssReport:
 
     @property
     def differs(self) -> bool:
-        """Whether its slow error, or that of the other receiver, is clearly larger than taken by default."""
+        """Whether its slow error, or that of the other receiver, is clearly larger than the default."""
         return self.slow_error and self.apart_m > _DIFFERS * SlowErrorConfig().horizontal_sigma_m
 
 
@@ -252,16 +272,19 @@ class CompassReport:
     """An orientation that may be a compass, judged by the GNSS course in motion.
 
     Attributes:
-        usable: whether it fits the course; convention: the better one.
-        offset_deg: mean of yaw minus course; scatter_deg: its circular standard deviation.
-        leeway_deg: how far that wanders, from half minute to half minute: leeway, or the compass; None where it is not told.
-            Of a vessel that is set sideways, both are None, but of two antennas athwart.
-        samples: courses compared; why: the judgement in words. unit: of bare numbers, else None.
-        like: an orientation that says the same, of the same device, else ''.
-        wander_deg: how far its error wanders beside the gyroscope, 1 sigma for a minute; None where that does not tell.
-        two_antennas: whether a GNSS receiver says it, by its sentence, its topic, or as an Imu with an orientation alone.
-        late_s: what should be added to its stamps by the gyroscope, s, and 1 sigma; None where that does not tell. What is said above is
-            of corrected stamps. late_with_fixes: not the gyroscope tells it, but the fixes of the same messages.
+        usable: whether it is a heading. convention: 'enu' or 'ned', the one that fits better.
+        offset_deg: median of yaw minus course. scatter_deg: its scatter, 1 sigma, robust.
+        leeway_deg: how far the offset wanders from half minute to half minute, by leeway or the compass; None if
+            unknown. Of a vessel that is set sideways, this and the offset are None, unless two antennas are mounted
+            athwart.
+        samples: number of courses compared. why: the judgement in words. unit: of bare numbers; else None.
+        like: an orientation of the same device that says the same; else ''.
+        wander_deg: wander of its error beside the gyroscope, 1 sigma in a minute; None if that is not told.
+        two_antennas: whether a GNSS receiver says it, by its sentence, its topic, or as an Imu with an orientation
+            alone.
+        late_s: what should be added to its stamps by the gyroscope, s, and 1 sigma; None if that is not told. All other
+            fields are of corrected stamps.
+        late_with_fixes: whether `late_s` is by the fixes of the same messages instead of the gyroscope.
         drifts: whether its north is its own, so that it drifts as a gyroscope does.
     """
 
@@ -284,12 +307,15 @@ class CompassReport:
 
     @property
     def ahead(self) -> bool:
-        """Whether it is that of the course, nearly."""
+        """Whether it is along the course, nearly."""
         return self.usable and self.offset_deg is not None and abs(self.offset_deg) < 180.0 - _ASTERN_DEG
 
     @property
     def turned_deg(self) -> float:
-        """By how much it is taken to be turned in the craft: by quarters, unless the course says otherwise; 0 where leeway explains that, or nothing tells."""
+        """Yaw of its mount that is assumed: a multiple of 90 deg, unless the course clearly says otherwise.
+
+        It is 0 where leeway explains the offset, or nothing tells.
+        """
         if self.offset_deg is None or abs(self.offset_deg) <= TURNED_DEG:
             return 0.0
         quarter = 90.0 * round(self.offset_deg / 90.0)
@@ -297,12 +323,12 @@ class CompassReport:
 
     @property
     def backwards(self) -> bool:
-        """Whether it is half a turn off the course, as one that is mounted backwards, or of a vessel that goes astern."""
+        """Whether it is half a turn off the course: it is mounted backwards, or the vessel goes astern."""
         return self.usable and self.offset_deg is not None and abs(self.offset_deg) > _ASTERN_DEG
 
 
 class Side(NamedTuple):
-    """By how much what is felt to the side goes with y of a log, to port: +1, or -1 of one to starboard; 1 sigma."""
+    """Factor from y of a log to what the IMU feels to port, and its 1 sigma: +1 if y is to port, -1 to starboard."""
 
     factor: float
     sigma: float
@@ -314,19 +340,26 @@ class Side(NamedTuple):
 
     @property
     def said(self) -> str:
-        """The evidence, in words."""
+        """The evidence in words."""
         side = "port" if self.to_port else "starboard"
         return f"y looks to {side}, as what the IMU feels there is {self.factor:+.2f} +- {self.sigma:.2f} times what it says"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VelocityReport:
-    """A velocity topic: the axes that fit the GNSS track (unknown: none does; None: nothing to judge by), and why.
+    """A velocity topic.
 
-    `late_s` as of a receiver, `late_with_fixes` as of a compass. `reverse`: it says astern throughout, which is taken for a wrong sign. `mount`: of one whose own axes are known by its type.
-    `sideways`: a log's, or that of one which sits turned, that tells its speed to the side, too. `rpy_deg`: how its axes sit by tf, where the
-    track does not deny it. `side`: which way y looks, where it tells a speed to the side; None: it tells none, or nothing shows which.
-    `rises`: whether it tells a speed up or down, too. `unsided`: whether it tells a speed to a side, and nothing shows which.
+    Attributes:
+        topic, msgtype, frame_id: of its messages. tf_frame: its frame, where tf leads to it; else None.
+        axes: those that fit the GNSS track; 'unknown' if none fits, None if nothing tells. why: the evidence.
+        late_s: see `GnssReport`. late_with_fixes: see `CompassReport`.
+        reverse: whether it says astern throughout, which is taken for a wrong sign.
+        mount: of a Doppler log, whose axes are known by its type; else None.
+        sideways: whether it is a log, or mounted turned, and also tells a speed along its y.
+        rpy_deg: rotation of its axes by tf, where the track does not deny it; else None.
+        side: which way y points, where it tells a speed along y; None if it tells none, or nothing shows the side.
+        rises: whether it also tells a speed up or down.
+        unsided: whether it tells a speed along y, and nothing shows the side.
     """
 
     topic: str
@@ -355,11 +388,17 @@ class VelocityReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryReport:
-    """An odometry or pose topic: role is 'truth', 'check_speed', 'pose', or 'other' of what is no pose of the vessel.
+    """An odometry or pose topic.
 
-    `origin`: latitude, longitude (deg) and height (m) of its frame's origin, where the frame is
-    east-north-up by the fixes; `world`: the evidence. `grid`: whether its positions are as large as in a map grid. `reverse`: as of a
-    velocity. `fused`: whether it is the output of a filter or an INS, by its name or as no wheels know its frame: the fixes are in it already.
+    Attributes:
+        topic, msgtype, frame_id: of its messages.
+        role: 'truth', 'check_speed', 'pose', or 'other' if it is no pose of the vessel. why: the evidence.
+        max_speed_mps: largest forward speed that it reports.
+        origin: latitude, longitude (deg) and height (m) of its frame's origin, if the frame is east-north-up by the
+            fixes; else None. world: the evidence.
+        grid: whether its positions are as large as in a map grid. reverse: see `VelocityReport`.
+        fused: whether it is the output of a filter or an INS, which has used the fixes: by its name, or because wheels
+            cannot know its frame.
     """
 
     topic: str
@@ -377,14 +416,15 @@ class OdometryReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MountedTopic:
-    """A topic of clouds or images: the frame of its first message.
+    """A topic of clouds or images.
 
     Attributes:
-        tf_frame: the same where tf leads to it, else None. info_topic: a camera's CameraInfo, else ''; info_why: what tells
-            that, where it does not lie beside it. listed: it holds what a detector found, not images. left_out: why it is not
-            drafted, else ''. optical: mount of a camera's optical frame, xyz (m) and roll, pitch, yaw (deg), where tf's frame of it
-            is another one.
-        latency_s: recording time minus header stamp of its first message, s; None where that has no stamp.
+        frame_id: frame of its first message. tf_frame: this frame, where tf leads to it; else None.
+        info_topic: a camera's CameraInfo; else ''. info_why: what tells that, unless it is beside the images.
+        listed: whether it holds a detector's findings instead of images. left_out: why it is not drafted; else ''.
+        optical: mount of a camera's optical frame, xyz (m) and roll, pitch, yaw (deg), where the frame in tf is another
+            one; else None.
+        latency_s: recording time minus header stamp of its first message, s; None if that has no stamp.
     """
 
     topic: str
@@ -400,9 +440,10 @@ class MountedTopic:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
-    """All of it.
+    """All that `inspect` found.
 
-    `in_body`: places (m) and rpy (deg) of frames in body, where tf has its body's axes ahead, to starboard, down.
+    `in_body`: by frame, its place (m) and rpy (deg) in body, if the axes of tf's body are ahead, to starboard, down;
+    else empty.
     """
 
     source: str
@@ -421,14 +462,14 @@ class Inspection:
 
     @property
     def usable(self) -> bool:
-        """Whether any of it can be a sensor."""
+        """Whether any topic can be a sensor."""
         poses = any(o.role == "pose" or o.grid for o in self.odometry)
         compasses = any(c.usable for c in self.compasses)
         return bool(self.imus or self.gnss or compasses or poses or self.velocities or self.lidars or self.cameras)
 
     @property
     def in_a_grid(self) -> tuple[OdometryReport, ...]:
-        """Positions in a map grid that stand for fixes, where no receiver tells a latitude."""
+        """Odometries with positions in a map grid that stand for fixes, if there is no receiver."""
         return () if self.gnss else tuple(item for item in self.odometry if item.grid)
 
     def as_dict(self) -> dict[str, Any]:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signs of a wrong configuration in a whole run: units, gravity, fixes far from the datum. Warned of, never corrected silently."""
+"""Signs of a wrong configuration in a whole run: units, gravity, fixes far from the datum.
+
+They are warned of or refused, never corrected silently.
+"""
 
 from __future__ import annotations
 
@@ -22,24 +25,24 @@ NEVER_STILL_RADPS = 0.5
 HALF = "half an IMU, and both halves must come in one message (RealSense: unite_imu_method)"
 FAR_LEVER_M = 50.0
 """A sensor this far from the origin of body is on a ship, or its mount is not in metres."""
-_FEWEST = 100  # samples, that are not all 0 by chance
+_FEWEST = 100  # so many samples are not all 0 by chance
 _SWING_NS, _NO_SWING_RAD = 5_000_000_000, 1.5
-_STEP_S = 0.2  # at most, of a step that rates are integrated over
-_GRAVITY_S, _FEWEST_WINDOWS = 0.4, 10  # windows whose mean acceleration tells where up is
-_LEAST_RANGE_MPS2, _LEAST_RANGE_RADPS = 19.0, 1.7  # no IMU has less (2 g, 100 deg/s)
-# Readings at the end of the range that are no chance; the band beneath it (a share of it), in which fewer lie.
+_STEP_S = 0.2  # longest step over which rates are integrated
+_GRAVITY_S, _FEWEST_WINDOWS = 0.4, 10  # duration and least number of windows whose mean acceleration tells where up is
+_LEAST_RANGE_MPS2, _LEAST_RANGE_RADPS = 19.0, 1.7  # no IMU has a smaller range (2 g, 100 deg/s)
+# Fewer readings at the end of the range may be chance; the band beneath the end (a share of it) must hold no more.
 _CUT, _BENEATH = 5, 0.03
-# Share of the samples, which turn least; what they turn by at most where turns are no matter.
+# Share of the samples that turn least; the craft is at ease if their rates are below this.
 _LEAST_TURNING, _AT_EASE_RADPS = 0.3, 0.3
-_LEAST_GRAVITY_MPS2, _MOST_GRAVITY_MPS2 = 8.5, 11.5  # between which a median acceleration may be gravity
-_EXPLAINED = 0.75  # of what its direction moves by, that rates in rad/s leave at most
+_LEAST_GRAVITY_MPS2, _MOST_GRAVITY_MPS2 = 8.5, 11.5  # a median acceleration between these may be gravity
+_EXPLAINED = 0.75  # largest share of the motion of gravity's direction that rates in rad/s leave unexplained
 
 
 def lever_warning(name: str, t_body_sensor_m: Array, tf_frame: str | None) -> list[str]:
-    """Return a line on a sensor (its `name`, as in vessel.yaml) so far from body (3,), m, that a mount in cm or mm is likelier.
+    """Return a warning on a sensor so far from the origin of body that a mount in cm or mm is likelier.
 
     Args:
-        tf_frame: its frame in /tf_static, where the mount is from there.
+        name: as in vessel.yaml. t_body_sensor_m: (3,). tf_frame: in /tf_static, if the mount is from there; else None.
     """
     far_m = float(np.linalg.norm(t_body_sensor_m))
     if far_m <= FAR_LEVER_M:
@@ -49,10 +52,11 @@ def lever_warning(name: str, t_body_sensor_m: Array, tf_frame: str | None) -> li
 
 
 def size_at_ease(accel: Array, gyro_radps: Array) -> tuple[float, bool]:
-    """Return the median size of accelerations (N, 3) while the craft turns least, and whether that is little: then it is gravity's alone.
+    """Return the median size of accelerations (N, 3) while the craft turns least, and whether it then hardly turns.
 
-    A fast one in tight circles feels as much again. Rates (N, 3) in deg/s never are little. In a gait, or waves, rates are least at one
-    phase of the heave: then the median of all is nearer to gravity, in either unit, and is returned.
+    If it hardly turns, the size is gravity's alone: a fast craft in tight circles feels as much again. Rates (N, 3) in
+    deg/s are never that small. In a gait or waves, rates are least at one phase of the heave: then the median of all
+    samples is nearer to gravity, in m/s^2 or g, and is returned instead.
     """
     rates, sizes = np.linalg.norm(gyro_radps, axis=1), np.linalg.norm(accel, axis=1)
     least = float(np.quantile(rates, _LEAST_TURNING))
@@ -62,7 +66,11 @@ def size_at_ease(accel: Array, gyro_radps: Array) -> tuple[float, bool]:
 
 
 def no_gravity_in_si(size: float, at_ease: bool) -> bool:
-    """Return whether accelerations are too small or too large to be gravity in m/s^2; `size` (in their unit), `at_ease`: see `size_at_ease`."""
+    """Return whether accelerations are too small or too large to be gravity in m/s^2.
+
+    Args:
+        size: in their unit. at_ease: whether the craft hardly turns, see `size_at_ease`.
+    """
     return size < _LEAST_GRAVITY_MPS2 or (size > _MOST_GRAVITY_MPS2 and at_ease)
 
 
@@ -74,10 +82,11 @@ def without_gravity(accel: Array) -> bool:
 
 
 def turns_gravity(stamps_ns: NDArray[np.int64], accel: Array, gyro_radps: Array) -> bool:
-    """Return whether rates (N, 3) turn the direction of accelerations (N, 3) as rad/s would; in deg/s they turn it by far more.
+    """Return whether rates (N, 3) turn the direction of accelerations (N, 3) as rad/s would; deg/s turn it by far more.
 
-    Gravity stays where it is while the sensor turns. The thrust of a craft or of a hand is in it as well, so that half of the
-    windows may fit by chance; rates of 57 times the size fit in none, unless they turn it round and round: then it is anywhere.
+    Gravity keeps its direction in world while the sensor turns. Accelerations also hold the thrust of a craft or a
+    hand, so half of the windows may not fit. Rates that are 57 times too large fit in no window. If they turn by more
+    than half a turn in a window, nothing is told.
     """
     t = (stamps_ns - stamps_ns[0]) / 1e9
     begins = np.unique((t / _GRAVITY_S).astype(np.int64), return_index=True)[1]
@@ -95,7 +104,7 @@ def turns_gravity(stamps_ns: NDArray[np.int64], accel: Array, gyro_radps: Array)
 
 
 def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuConfig) -> list[str]:
-    """Return lines on the unit, gravity and range of accelerations (N, 3) and rates (N, 3), converted as configured."""
+    """Return warnings on unit, gravity and range of accelerations (N, 3) and rates (N, 3), converted as configured."""
     if len(accel_mps2) < 10:
         return []
     g, at_ease = size_at_ease(accel_mps2, gyro_radps)
@@ -112,7 +121,7 @@ def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuC
 
 
 def slow_warning(sensor: str, stamps_ns: NDArray[np.int64], config: ImuConfig) -> list[str]:
-    """Return a line on an IMU whose samples, at stamps (N,), are so far apart that each interval is a gap, and the motion in it unknown."""
+    """Return a warning on an IMU whose samples, at stamps (N,), are so far apart that each interval is a gap."""
     apart_s = float(np.median(np.diff(stamps_ns))) / NS_PER_S if len(stamps_ns) > 1 else 0.0
     if apart_s <= config.max_gap_s:
         return []
@@ -121,7 +130,10 @@ def slow_warning(sensor: str, stamps_ns: NDArray[np.int64], config: ImuConfig) -
 
 
 def fast_warning(imu: ImuSeries, config: ImuConfig) -> list[str]:
-    """Return a line on rates that are so fast throughout that deg/s are likelier, where no unit is set, unless gravity turns as they say."""
+    """Return a warning if rates are so fast throughout that deg/s are likelier.
+
+    Not if a unit is configured, or if gravity turns as the rates say.
+    """
     rate = float(np.median(np.linalg.norm(imu.gyro_radps, axis=1)))
     fast = "gyro_unit" not in config.model_fields_set and rate > NEVER_STILL_RADPS
     if not fast or turns_gravity(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps):
@@ -130,9 +142,10 @@ def fast_warning(imu: ImuSeries, config: ImuConfig) -> list[str]:
 
 
 def saturation_warning(sensor: str, accel_mps2: Array, gyro_radps: Array) -> list[str]:
-    """Return a line on the axes of accelerations (N, 3) and rates (N, 3) that pile up at their largest reading: the range ends there.
+    """Return a warning on the axes of accelerations (N, 3) and rates (N, 3) that saturate.
 
-    What lies beyond is lost, and with it the velocity and the tilt of every knock or wave that is cut off.
+    Their samples pile up at the largest reading, where the range ends. What lies beyond is lost, and with it the
+    velocity and tilt of every knock or wave that is cut off.
     """
     said, cut = [], np.zeros(len(accel_mps2), dtype=bool)
     for name, unit, values, least in (
@@ -156,7 +169,7 @@ def saturation_warning(sensor: str, accel_mps2: Array, gyro_radps: Array) -> lis
 
 
 def missing_half(accel: Array, gyro: Array) -> str:
-    """Return 'rates' or 'accelerations' if all of these (N, 3) are 0, as some drivers publish; else ''.
+    """Return 'rates' or 'accelerations', whichever (N, 3) are all 0, as some drivers publish them; else ''.
 
     A simulated IMU without noise has zero rates at rest, but then constant accelerations.
     """
@@ -171,7 +184,7 @@ def refuse_half(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuCo
     """Refuse accelerations or rates (N, 3) that are all 0, since the solver would believe them.
 
     Raises:
-        InputError: they are.
+        InputError: all accelerations or all rates are 0.
     """
     missing = missing_half(accel_mps2, gyro_radps)
     if missing:
@@ -179,12 +192,12 @@ def refuse_half(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuCo
 
 
 def refuse_accel_unit(sensor: str, accel_mps2: Array, config: ImuConfig) -> None:
-    """Refuse accelerations (N, 3) that, converted as configured, are g for m/s^2 or the reverse.
+    """Refuse accelerations (N, 3), converted as configured, that are in g instead of m/s^2 or the reverse.
 
     The solver would run for minutes, and lay the vessel on its side.
 
     Raises:
-        InputError: they are.
+        InputError: the accelerations are in the other unit.
     """
     g = float(np.median(np.linalg.norm(accel_mps2, axis=1))) if len(accel_mps2) >= 10 else STANDARD_GRAVITY_MPS2
     in_g = config.accel_unit == "m/s^2" and 0.9 < g < 1.1 and not without_gravity(accel_mps2)
@@ -201,8 +214,9 @@ def refuse_degrees(
 ) -> None:
     """Refuse rates (N, 3) in deg/s, with which the solver would run for many minutes.
 
-    The test is by how much they roll and pitch the vessel within 5 s: a small boat in chop has high rates, and a vehicle may pivot
-    fast, but none rolls by a quarter turn all the time. What does, as a camera in the hand, turns gravity as its rates say.
+    The test is by how much they roll and pitch the vessel within 5 s: a small boat in chop has high rates, and a
+    vehicle may pivot fast, but none rolls by a quarter turn all the time. What does, as a camera in the hand, turns
+    gravity as its rates say.
 
     Raises:
         InputError: they are.
@@ -246,7 +260,7 @@ def far_pose(pose: PoseFix) -> bool:
 
 
 def gnss_warnings(sensor: str, fixes: Sequence[GnssPosition], config: VesselConfig) -> list[str]:
-    """Return a line if the fixes are far from the configured datum, and say so if swapped coordinates explain it."""
+    """Return a warning if the fixes are far from the configured datum, also if swapped coordinates explain it."""
     if config.datum is None or not fixes:
         return []
     datum = Datum(config.datum.geodetic)

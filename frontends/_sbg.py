@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of SBG Systems: Ellipse, Ekinox, Apogee. With `use_enu` its driver writes east, north, up and counter-clockwise from east."""
+"""Messages of SBG Systems: Ellipse, Ekinox, Apogee.
+
+With `use_enu` its driver writes velocities east, north, up, and yaw counter-clockwise from east.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +25,12 @@ from graphloc.frontends._vendor_said import (
     yaw_of,
 )
 
-# Of NavSatStatus, by type of solution; PPP converges slowly.
+# Type of solution to NavSatStatus; PPP converges slowly, so it is no RTK.
 _SBG_STATUS = {1: 0, 2: 0, 3: 1, 4: 1, 5: 1, 6: 2, 7: 2, 8: 1, 9: 1}
 _SBG_NONE = {0: "none", 10: "a position that was set, not measured"}
 _SBG_CRITICAL, _SBG_SPOOFED = 4, 4
 _SBG_PER_MPS2, _SBG_PER_RADPS = 1_048_576.0, (67_108_864.0, 12_304_174.0)  # counts, in either range of the gyroscope
-_SBG_COMPUTED = 0x3F  # bits of a status that are 0 of a computed solution
+_SBG_COMPUTED = 0x3F  # bits of a status that are 0 if the solution was computed
 
 
 def _sbg_imu_trouble(msg: Any) -> Rejection | None:
@@ -48,7 +51,7 @@ def _sbg_imu_short(msg: Any) -> SaidInertial | Rejection:
 
 
 def _sbg_where(msg: Any) -> tuple[float, float, float]:
-    """Latitude, longitude, deg, and height above the ellipsoid, m."""
+    """Return latitude and longitude, deg, and height above the ellipsoid, m."""
     if hasattr(msg, "latitude"):
         place = float(msg.latitude), float(msg.longitude), float(msg.altitude)
     else:  # until 2021, a vector; a version in between wrote longitude first where set to ENU, which nothing tells

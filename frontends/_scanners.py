@@ -17,19 +17,19 @@ from graphloc.frontends._tf import WORLD_NAMES
 from graphloc.frontends.tags.listed import LISTS
 from graphloc.frontends.tags.sightings import INFO, camera_info_topic, is_rectified
 
-# Clouds that were made of another one; those of depth cameras and radars.
+# Topics of clouds that were made from other clouds; then of depth cameras and radars.
 _DERIVED = re.compile(r"filter|crop|voxel|sampl|ground|cluster|segment|obstacle|register|skew|second", re.IGNORECASE)
 _NO_LIDAR = re.compile(r"depth|radar|stereo", re.IGNORECASE)
-_LOOKS_AHEAD_DEG = np.array([-90.0, 0.0, -90.0])  # of an optical frame
-_SKY = 0.7  # upward part of an optical axis, from which no tag is seen
+_LOOKS_AHEAD_DEG = np.array([-90.0, 0.0, -90.0])  # roll, pitch, yaw of an optical frame that looks ahead
+_SKY = 0.7  # upward component of an optical axis from which no tag is seen
 
 
 def lidars_of(bag: Contents) -> tuple[MountedTopic, ...]:
-    """Return the topics of clouds; of those in one LiDAR's frame one is to be read, and none that a program placed in the world."""
+    """Return the topics of clouds; of those in one LiDAR's frame, one is to be read, of those in a world frame none."""
     lidars, body = _mounted(bag, bag.lidars), bag.tree.body()
     first: dict[str, str] = {}
     for lidar in sorted(lidars, key=lambda m: (bool(_DERIVED.search(m.topic)), len(m.topic))):
-        if lidar.frame_id not in ("", body):  # clouds of several LiDARs may have been moved there
+        if lidar.frame_id not in ("", body):  # clouds of several LiDARs may have been transformed to body
             first.setdefault(lidar.frame_id, lidar.topic)
 
     def why_not(lidar: MountedTopic) -> str:
@@ -48,7 +48,7 @@ def lidars_of(bag: Contents) -> tuple[MountedTopic, ...]:
 
 
 def cameras_of(bag: Contents) -> tuple[MountedTopic, ...]:
-    """Return the topics of images and of tag lists; of those that show the same camera's images one is to be read.
+    """Return the topics of images and of tag lists; of topics of one camera, one is to be read.
 
     Of a camera, images come first, whose noise the detector measures, before those that were resampled, and lists.
     """
@@ -97,7 +97,7 @@ def _camera(bag: Contents, camera: MountedTopic) -> MountedTopic:
 
 
 def _optical(bag: Contents, camera: MountedTopic) -> tuple[Vec, Vec] | None:
-    """Return the mount of a camera's optical frame where tf's frame of it has x ahead and z up: drivers name `camera_link`."""
+    """Return the mount of a camera's optical frame if its frame in tf, as `camera_link`, has z up; else None."""
     pose = bag.tree.resolve(bag.tree.body(), camera.tf_frame) if camera.tf_frame else None
     if pose is None or pose[1][2, 2] < _SKY:
         return None

@@ -23,7 +23,7 @@ _SBF_STATUS = {1: 0, 2: 1, 4: 2, 5: 2, 6: 1, 7: 0, 8: 0, 10: 1}  # of a moving b
 _SBF_NONE = {0: "none", 3: "a position that was set, not measured"}
 _SBF_MODE, _SBF_2D, _SBF_UNKNOWN = 0x0F, 0x80, 65535
 _SBF_FIXED = (2, 4)
-_SBF_BASELINE = 3  # bits of an attitude's error: of the first baseline
+_SBF_BASELINE = 3  # bits, in an attitude's error, of the first baseline
 
 
 def _sbf_trouble(msg: Any) -> Rejection | None:
@@ -41,7 +41,7 @@ def _sbf_place(msg: Any) -> SaidPlace | Rejection:
     if trouble := _sbf_trouble(msg):
         return trouble
     height = float("nan") if int(msg.mode) & _SBF_2D else float(msg.height)
-    # Twice the RMS of the horizontal distance, and two sigmas of the height, in cm.
+    # The fields are twice the RMS of the horizontal distance, and two sigmas of the height, in cm.
     horizontal, vertical = (
         0.0 if int(cm) == _SBF_UNKNOWN else 0.005 * float(cm) for cm in (msg.h_accuracy, msg.v_accuracy)
     )

@@ -94,19 +94,19 @@ ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
     **dict.fromkeys(GPS_FIXES, _fix_row),
     **dict.fromkeys(NUMBERS, lambda m: (m.data,)),
 }
-# Places that no sensor of the craft says: wanted ones, the origin of a filter, other vessels, the truth.
+# Topics of places that are not measured by a sensor of the craft: goals, origins of filters, other vessels, the truth.
 _ELSEWHERE = re.compile(
     r"click|person|obstacle|look_?ahead|origin|home(?![a-z])|set_?point|goal|target|waypoint|cmd|command|desired|contact|aton|anchor|truth|/gt(?![a-z])",
     re.IGNORECASE,
 )
-_HEADING = re.compile(r"head|hdg|hdt|yaw|compass|azimuth", re.IGNORECASE)  # a topic of numbers that may be one
+_HEADING = re.compile(r"head|hdg|hdt|yaw|compass|azimuth", re.IGNORECASE)  # a topic of bare numbers may be a heading
 
 
 def _nmea_fix(text: str, wanted: str) -> Row | None:
     said = nmea.fix(text, [wanted])
     if isinstance(said, Rejection):
         return None if said.outcome is Outcome.MALFORMED else (np.nan, np.nan, np.nan, -1.0, 0.0, 0.0, 0.0, 0.0)
-    # Of RTK the quality tells a sigma; else nothing does, as of a NavSatFix without a covariance (kind 0).
+    # Only the qualities of RTK imply a sigma; other fixes are as a NavSatFix without a covariance (kind 0).
     horizontal, vertical = nmea_sigmas_m(said, (0.0, 0.0))
     status = NMEA_STATUS.get(said.quality, 0)
     place = (said.latitude_deg, said.longitude_deg, said.height_m)
@@ -135,20 +135,24 @@ def _nmea_speed(text: str, wanted: str, through: str = "ground") -> Row | None:
     return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (*said, *(0.0,) * (3 - len(said)))
 
 
-# Of a sentence: the message type that says the same, and its row; None of a damaged one.
+# By sentence: the message type of the same content, and a function that returns its row, None if it is damaged.
 SENTENCES: dict[str, tuple[str, Callable[[str, str], Row | None]]] = {
     **dict.fromkeys(nmea.HEADINGS, (QUATERNION, _nmea_heading)),
     "VTG": (TWIST, _nmea_velocity),
     **dict.fromkeys(nmea.SPEEDS, (TWIST, _nmea_speed)),
     **dict.fromkeys(nmea.PLACES, (NAV_SAT_FIX, _nmea_fix)),
 }
-_SATELLITES = re.compile("(G[A-Z]|BD)[A-Z]{3}")  # a talker that names what a receiver sees
-_BESIDE, _BY_CHANCE = 0.75, 0.2  # steps: a sentence said at the same time; the share of those that one receiver may say
+_SATELLITES = re.compile("(G[A-Z]|BD)[A-Z]{3}")  # a talker ID that names the satellite systems of a receiver
+# Sentences of two talkers that are recorded less than so many steps apart are of the same moment; the largest share of
+# such sentences that talkers of one receiver may have.
+_BESIDE, _BY_CHANCE = 0.75, 0.2
 _DAY_S, _FEWEST_TIMES = 86_400.0, 20
-_AS_OFTEN = 0.8  # of the sentences with a velocity, from which VTG says what RMC says; some receivers leave it empty, or say it every other time
+# Least number of velocities in VTG, as a share of those in RMC, from which VTG replaces RMC: some receivers leave VTG
+# empty, or say it every other time.
+_AS_OFTEN = 0.8
 COURSE, HEADING = " (course, speed)", " (heading)"
-"""At the end of the name of a stream: what RMC, a GPSFix, or a maker's message, says beside a place."""
-# Of what makers' messages say: the message type that says the same, and a row without a value.
+"""Endings of the names of streams: what RMC, a GPSFix or a maker's message says beside a place."""
+# By kind of a part of makers' messages: the message type of the same content, and a row without a value.
 _LIKE: dict[str, tuple[str, Row]] = {
     "imu": (IMU, (*[np.nan] * 6, *[0.0] * 4, 0.0, 0.0, -1.0)),
     "gnss": (NAV_SAT_FIX, (np.nan, np.nan, np.nan, -1.0, 0.0, 0.0, 0.0, 0.0)),
@@ -169,7 +173,7 @@ def _said_row(said: Said) -> Row:
             return said.v_mps
         case SaidHeading():
             return (0.0, 0.0, float(np.sin(said.angle_rad / 2.0)), float(np.cos(said.angle_rad / 2.0)))
-        case SaidAlong():  # ahead, to port, up
+        case SaidAlong():  # from ahead, to starboard, down to ahead, to port, up
             return (said.v_mps[0], -said.v_mps[1], -said.v_mps[2])
 
 
@@ -182,11 +186,17 @@ class TopicData:
 
     Arrays are made once, and cannot be written to.
 
-    recorded: whether the stamps are recording times, because the headers hold none, or whole seconds only.
-    broken: why the first message that cannot be decoded is that.
-    frames: how many messages name each frame_id.
-    part: what it is of a maker's message; None of other messages. filtered: how many of these a filter made, by what they say.
-    drift_ppm: by how much the clock ran fast; what it gained is taken off the stamps. elapsed: (N,) ns from the beginning of the bag.
+    Attributes:
+        topic: name of the stream, for a plain topic that of the topic. msgtype: the type, or that of the same content.
+        frame_id: the first one that is not empty. frames: how many messages name each frame_id.
+        undecodable: number of messages that cannot be decoded. broken: why, of the first one.
+        no_stamp: number of messages that were dropped because they have no stamp.
+        recorded: whether the stamps are recording times, because the headers hold none, or whole seconds only.
+        drift_ppm: by how much the clock ran fast; what it gained has been taken off the stamps.
+        part: which part of a maker's message it is; None of other messages.
+        filtered: how many of a maker's messages say that a filter made them.
+        tuples: the rows as they were added. files: the file of each message.
+        elapsed: (N,) ns from the beginning of the bag until a message was recorded.
     """
 
     topic: str
@@ -205,7 +215,7 @@ class TopicData:
     tuples: list[tuple[float, ...]] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
     elapsed: list[int] = field(default_factory=list)
-    # Made of the lists, once each; copies share the rows.
+    # Arrays made from the lists, once each; copies of a stream share the rows.
     _rows: Array | None = field(default=None, compare=False)
     _made: dict[str, NDArray[np.int64]] = field(default_factory=dict, init=False, compare=False)
 
@@ -220,13 +230,13 @@ class TopicData:
         self.tuples.append(row)
 
     def _anew(self) -> None:
-        """Forget the arrays that were made of the lists."""
+        """Forget the arrays that were made from the lists."""
         self._rows = None
         self._made.clear()
 
     @classmethod
     def joined(cls, topic: str, parts: Sequence[TopicData]) -> TopicData:
-        """Return the messages of several streams of one type as one, in the order of their recording."""
+        """Return several streams of one type as one, with messages in the order of recording."""
         whole = cls(topic, parts[0].msgtype, parts[0].frame_id, sum(p.undecodable for p in parts))
         whole.frames = sum((p.frames for p in parts), Counter())
         messages = [
@@ -239,7 +249,10 @@ class TopicData:
         return whole
 
     def settle(self) -> None:
-        """Drop messages without a stamp; if no message has one that tells when it was measured, use the recording times."""
+        """Drop messages without a stamp, in place; where stamps do not tell the time, use recording times.
+
+        They do not if all are equal, or if they are whole seconds, see `_in_whole_seconds`.
+        """
         stamps = self.stamps_ns
         if len(stamps) > 1 and (bool((stamps == stamps[0]).all()) or self._in_whole_seconds()):
             self.recorded, self._stamps = True, list(self._logs)
@@ -255,9 +268,9 @@ class TopicData:
         self._anew()
 
     def _in_whole_seconds(self) -> bool:
-        """Whether several measurements a second are stamped in whole seconds, and are recorded one after another.
+        """Return whether stamps are whole seconds though several measurements a second were recorded, one by one.
 
-        Not those of a receiver that measures once a second, whose driver repeats each with its stamp.
+        Not so of a receiver that measures once a second, whose driver repeats each measurement with its stamp.
         """
         if (self.stamps_ns % NS_PER_S).any():
             return False
@@ -277,7 +290,7 @@ class TopicData:
         return replace(self, _stamps=stamps_ns.tolist())
 
     def without_drift(self, ppm: float) -> TopicData:
-        """Return the stream with what a clock that runs fast has gained taken off its stamps."""
+        """Return the stream with the gain of a clock that runs fast by `ppm` taken off its stamps."""
         gained = np.rint(1e-6 * ppm * np.array(self.elapsed, dtype=float)).astype(np.int64)
         return replace(self, _stamps=(self.stamps_ns - gained).tolist(), drift_ppm=ppm)
 
@@ -315,15 +328,21 @@ class Sentences:
     """What NMEA tells beside the streams.
 
     Attributes:
-        unread: by topic how many sentences nothing reads, by name. after_s: by stream ('TOPIC GPGGA') how long after the time that a
-            place tells it is stamped, or recorded where it has no stamp, s, within half a day.
+        unread: by topic, the number of sentences that nothing reads, by their name.
+        after_s: by stream ('TOPIC GPGGA'), of each place: its stamp, or its recording time where it has no stamp, less
+            the time of day in the sentence, s, within half a day.
     """
 
     unread: dict[str, Counter[str]] = field(default_factory=dict)
     after_s: dict[str, list[float]] = field(default_factory=dict)
 
     def take(self, topic: str, text: str, places: Sequence[str], at_ns: int) -> None:
-        """Take in a message, stamped or recorded at `at_ns`; `places`: the streams that it tells a place of."""
+        """Take in a message.
+
+        Args:
+            topic, text: its topic and sentences. places: the streams to which it gave a place.
+            at_ns: its stamp, or its recording time where it has none.
+        """
         self.unread.setdefault(topic, Counter()).update(nmea.unread(text))
         for stream in places:
             after_s = at_ns * 1e-9 - nmea.time_of_day_s(text, stream.partition(" ")[2])
@@ -331,12 +350,12 @@ class Sentences:
                 self.after_s.setdefault(stream, []).append(float(_within_half_a_day(after_s)))
 
     def spread_s(self, stream: str) -> tuple[float, float, float] | None:
-        """Return the 5 %, 50 % and 95 % points of `after_s` of a stream, of all its talkers; None where too few tell."""
+        """Return the 5 %, 50 % and 95 % points of a stream's `after_s`, over all talkers; None of too few sentences."""
         topic, _, said = stream.partition(" ")
         told = [t for sentence in said.split("+") for t in self.after_s.get(f"{topic} {sentence}", ())]
         if len(told) < _FEWEST_TIMES:
             return None
-        about = np.median(told)  # not about noon
+        about = np.median(told)  # percentiles about the median: times of day wrap at half a day
         low, middle, high = np.percentile(_within_half_a_day(np.array(told) - about), [5.0, 50.0, 95.0])
         return float(about + low), float(about + middle), float(about + high)
 
@@ -349,10 +368,12 @@ def _within_half_a_day(seconds: Any) -> Any:
 def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree, Sentences]:
     """Read all topics of the types in `ROWS` and `VENDORS`, the static transforms, and what NMEA tells beside these.
 
-    An NMEA topic gives a stream per sentence and talker, named 'TOPIC GPGGA', of the equivalent message type; 'TOPIC GPGGA+GNGGA' of a
-    receiver that changes its talker. RMC gives another one of velocities, named 'TOPIC GPRMC (course, speed)', where it holds any and no
-    VTG is on the line; so does a GPSFix. VBW gives one over ground and one through water. A maker's message gives a stream of the equivalent type for each thing that it says. A Doppler log's
-    velocities through water are one named 'TOPIC (through water)', what a filter made one named 'TOPIC (of a filter)'.
+    An NMEA topic gives a stream per sentence and talker, of the message type with the same content, named 'TOPIC
+    GPGGA'; of a receiver that changes its talker ID, 'TOPIC GPGGA+GNGGA'. RMC and a GPSFix give a second stream, of
+    velocities, named 'TOPIC GPRMC (course, speed)', where they hold any and no VTG on the line tells them. VBW gives
+    one stream over ground and one through water. A maker's message gives a stream for each of its parts, of the message
+    type with the same content. A Doppler log's velocities through water are a stream named 'TOPIC (through water)'; a
+    stream that is mostly the output of a filter is named 'TOPIC (of a filter)'.
     """
     streams, tree = _empty_streams(bag), StaticTree()
     sentences = _fill(streams, tree, bag)
@@ -366,7 +387,10 @@ def read_streams(bag: Bag) -> tuple[list[TopicData], StaticTree, Sentences]:
 
 
 def _empty_streams(bag: Bag) -> dict[str, TopicData]:
-    """Return the streams of topics that can be one by their type and name, by their own names; sentences make theirs as they come."""
+    """Return empty streams, by name, of the topics whose type and name allow one.
+
+    Streams of NMEA sentences are added when a sentence comes first.
+    """
     streams = {
         t.topic: TopicData(t.topic, t.msgtypes[0])
         for t in bag.topics.values()
@@ -387,7 +411,7 @@ def _empty_streams(bag: Bag) -> dict[str, TopicData]:
 
 
 def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> Sentences:
-    """Read the messages of a bag into streams and transforms, in place; return what NMEA tells beside these."""
+    """Read the messages of a bag into `streams` and `tree`, in place; return what NMEA tells beside the streams."""
     sentences = Sentences()
     mixed = {t.topic for t in bag.topics.values() if len(t.msgtypes) == 1 and t.msgtypes[0] in NMEA}
     wanted = set(streams) | mixed | ({TF_STATIC, TF_MOVING} & set(bag.topics))
@@ -414,19 +438,23 @@ def _fill(streams: dict[str, TopicData], tree: StaticTree, bag: Bag) -> Sentence
 
 
 def _why_broken(error: Exception, msg: Any) -> str:
-    """Return why a message cannot be decoded; `msg`: it, unpacked by the definition in the bag, or None where its bytes do not fit that."""
+    """Return why a message cannot be decoded.
+
+    Args:
+        msg: the message, unpacked by its definition in the bag; None where its bytes do not fit this definition.
+    """
     if msg is None:
         return f"its bytes do not fit its definition ({type(error).__name__})"
     return f"by its definition in the bag it is another version than is read here: {in_one_line(error)}"
 
 
 def _places(said: Sequence[tuple[TopicData, Row | None]]) -> list[str]:
-    """Return the names of the streams of which a place is told."""
+    """Return the names of the streams to which a message gave a place."""
     return [s.topic for s, row in said if s.msgtype == NAV_SAT_FIX and row is not None and np.isfinite(row[:2]).all()]
 
 
 def _add(stream: TopicData, row: Row | None, raw: RawMessage, msg: Any) -> None:
-    """Add what a message says to a stream; None: nothing that could be decoded."""
+    """Add the row of a message to a stream; None: the message could not be decoded."""
     if row is None:
         stream.undecodable += 1
         return
@@ -440,7 +468,10 @@ def _add(stream: TopicData, row: Row | None, raw: RawMessage, msg: Any) -> None:
 
 
 def _of_no_use(streams: Mapping[str, TopicData]) -> list[str]:
-    """Return the names of streams that say nothing, or what others say as well; of a log's two one stays."""
+    """Return the names of streams that say nothing, or what other streams say as well.
+
+    Of a Doppler log's streams over ground and through water, at least one stays.
+    """
     told = {name for name, stream in streams.items() if np.isfinite(stream.rows).any()}
     return [
         name
@@ -452,17 +483,17 @@ def _of_no_use(streams: Mapping[str, TopicData]) -> list[str]:
 
 
 def _named_as_filters(stream: TopicData) -> TopicData:
-    """Return a stream with the name of a filter's, if most of what it says is of one."""
+    """Return the stream, with a name that says so if at least half of its complete rows are a filter's output."""
     if not (stream.filtered and len(stream)) or 2 * stream.filtered < np.isfinite(stream.rows).all(axis=1).sum():
         return stream
     return replace(stream, topic=stream.topic + FILTER)
 
 
 def _join_talkers(streams: dict[str, TopicData]) -> None:
-    """Put sentences into one stream whose talkers take turns.
+    """Join streams of one sentence, in place, whose talkers take turns.
 
-    A receiver that sees satellites of GPS alone says GP, and GN once it sees others: the talkers of one receiver never say the same
-    sentence within a step of each other, those of two receivers nearly always.
+    A receiver that uses GPS alone has the talker ID GP, and GN once it uses other satellites. So two talkers of one
+    receiver never say the same sentence within a step of each other; talkers of two receivers nearly always do.
     """
     alike: dict[tuple[str, str], list[TopicData]] = {}
     for name, stream in streams.items():
@@ -484,7 +515,11 @@ def _join_talkers(streams: dict[str, TopicData]) -> None:
 
 
 def _take_turns(logs_ns: Sequence[NDArray[np.int64]]) -> bool:
-    """Return whether no talker speaks while another one does, by the recording times (N,) of each, in order."""
+    """Return whether talkers take turns rather than speak at the same time.
+
+    Args:
+        logs_ns: (N,) recording times of each talker's sentences, in order.
+    """
     steps = [float(np.median(np.diff(own))) for own in logs_ns if len(own) > 2]
     if not steps or min(steps) == 0.0:  # recorded in bursts, or to the second: nothing tells who spoke when
         return False
@@ -500,14 +535,14 @@ def _take_turns(logs_ns: Sequence[NDArray[np.int64]]) -> bool:
 
 
 def _told_elsewhere(stream: TopicData, streams: Mapping[str, TopicData]) -> bool:
-    """Whether what is said beside a place is nothing, or what VTG on the same line says as well, and about as often."""
+    """Return whether what is said beside a place is nothing, or is said by VTG on the same line about as often."""
     line, least = bare_topic(stream.topic), _AS_OFTEN * _told(stream)
     vtg = any(name.startswith(f"{line} ") and name.endswith("VTG") and _told(s) >= least for name, s in streams.items())
     return vtg or not np.nan_to_num(stream.rows).any()
 
 
 def _told(stream: TopicData) -> int:
-    """Return how many messages of a stream tell something."""
+    """Return the number of messages of a stream without NaN."""
     return int(np.isfinite(stream.rows).all(axis=-1).sum()) if len(stream) else 0
 
 
@@ -525,13 +560,16 @@ def _plain(raw: RawMessage, msg: Any, streams: dict[str, TopicData]) -> list[tup
 
 
 def _parts(topic: str, msgtype: str) -> list[tuple[str, Part]]:
-    """Return the names of the streams of a maker's messages; the first one is named as the topic."""
+    """Return the parts of a maker's messages with the names of their streams; the first one is named as the topic."""
     beside = {"gnss_velocity": COURSE, "compass": HEADING}
     return [(topic + beside[part.kind] if k else topic, part) for k, part in enumerate(VENDORS[msgtype])]
 
 
 def _said_of(part: Part, msg: Any, name: str, streams: dict[str, TopicData]) -> tuple[TopicData, Row | None]:
-    """Return the stream and the row of a thing that a maker's message says; velocities through water have a stream of their own."""
+    """Return the stream and the row of one part of a maker's message, the row None if the message is damaged.
+
+    Velocities through water have a stream of their own.
+    """
     said = part.read(msg)
     if isinstance(said, Rejection):
         return streams[name], None if said.outcome is Outcome.MALFORMED else _LIKE[part.kind][1]
@@ -543,7 +581,7 @@ def _said_of(part: Part, msg: Any, name: str, streams: dict[str, TopicData]) -> 
 
 
 def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:
-    """Return the stream, created at first use, and the row of each sentence."""
+    """Return the stream, made at first use, and the row of each sentence in a message; None of a damaged sentence."""
     said: list[tuple[TopicData, Row | None]] = []
     text = nmea.text_of(msg)
     for talker, kind in nmea.identities(text):

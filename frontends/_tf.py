@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mounts from `/tf_static`: the chain of transforms from body to a sensor's frame.
 
-Of `/tf` those count that never change: ROS 1's `static_transform_publisher` of the package `tf` repeats them there.
+Transforms of `/tf` that never change count as well: ROS 1's `static_transform_publisher` of the package `tf` repeats
+its transforms there.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from graphloc.frontends.source import TF_MOVING, TF_STATIC, RawMessage
 WORLD_NAMES = ("map", "odom", "world", "earth", "utm", "camera_init")  # the last by LOAM
 _BODY_NAMES = ("base_link", "base_footprint", "body", "base", "vessel", "vehicle", "boat")
 
-_FARTHEST_M = 1e4  # no vessel is as long: such a transform is damaged, or of a map
+_FARTHEST_M = 1e4  # no vessel is so long: a longer transform is damaged, or of a map
 _OLD_TF = "tf/msg/tfMessage"  # of ROS 1 before tf2
-_DENSE = 1000  # messages of /tf; after n times as many, one in n is read: an hour may hold a million
-_GOLDEN = 0.6180339887498949  # its multiples leave no gap, whatever order frames are published in
-_SAME = 1e-6  # m, and of a quaternion: what is repeated is the same to the last digit
+_DENSE = 1000  # messages of /tf that are all read; after n times as many, one in n is: an hour may hold a million
+_GOLDEN = 0.6180339887498949  # its multiples pick messages evenly, in whatever order frames are published
+_SAME = 1e-6  # m, and of a rotation matrix: repeated transforms are equal to nearly the last digit
 
 Pose = tuple[Array, Array]  # t (3,), R (3, 3): T_parent_child
 
@@ -35,7 +36,7 @@ class StaticTree:
     """Static transforms by frame, searched in both directions.
 
     Attributes:
-        broken: messages that could not be used: another one may be intact.
+        broken: number of messages that could not be used; another message may be intact.
     """
 
     def __init__(self) -> None:
@@ -58,7 +59,7 @@ class StaticTree:
         self.broken += not whole
 
     def offer(self, raw: RawMessage, decode: Callable[[RawMessage], object]) -> None:
-        """Take a message of `/tf`, or leave it out where very many come. What cannot be decoded comes again."""
+        """Take a message of `/tf`, or skip it if there are very many. One that cannot be decoded is repeated anyway."""
         due = self._offered * _GOLDEN % 1.0 < _DENSE / max(_DENSE, self._offered)
         self._offered += 1
         if not due or raw.msgtype not in (TF, _OLD_TF):
@@ -72,7 +73,7 @@ class StaticTree:
                 self._compare(parent, child, pose)
 
     def _compare(self, parent: str, child: str, pose: Pose) -> None:
-        """Count a transform of /tf that is the same as before; one that changes is no mount."""
+        """Count a transform of /tf that equals the one before; a transform that changes is no mount."""
         before, same, count = self._repeated.get(child, (parent, pose, 0))
         if before != parent or max(np.abs(x - y).max() for x, y in zip(same, pose, strict=True)) > _SAME:
             self._moving.add(child)
@@ -81,9 +82,9 @@ class StaticTree:
             self._repeated[child] = (parent, same, count + 1)
 
     def settle(self) -> None:
-        """Join what `/tf` repeats, once all of it was offered, where `/tf_static` does not have it.
+        """Add the transforms that `/tf` repeats and `/tf_static` lacks, once all of `/tf` was offered.
 
-        Where the vessel lies still, its place in the world is repeated as well.
+        Transforms from world frames are left out: of a vessel that lies still, they are repeated as well.
         """
         for child, (parent, pose, count) in self._repeated.items():
             if count > 1 and child not in self._children and parent.rpartition("/")[2] not in WORLD_NAMES:
@@ -91,11 +92,11 @@ class StaticTree:
 
     @property
     def damage(self) -> str:
-        """A line on messages that could not be used; empty if there are none."""
+        """A warning on messages that could not be used; '' if there are none."""
         return f"{TF_STATIC}: messages that cannot be decoded: {self.broken}" if self.broken else ""
 
     def add(self, msg: Any) -> None:
-        """Add the transforms of a `tf2_msgs/TFMessage`; a later one replaces an earlier one of the same frames."""
+        """Add the transforms of a `tf2_msgs/TFMessage`; a later one replaces an earlier one between two frames."""
         for parent, child, pose in self._poses(msg):
             if pose is None:
                 self._unusable.add(child)
@@ -110,7 +111,7 @@ class StaticTree:
 
     @staticmethod
     def _poses(msg: Any) -> Iterator[tuple[str, str, Pose | None]]:
-        """Yield parent, child and T_parent_child of a message; None where no pose stands there."""
+        """Yield parent, child and T_parent_child of each transform; None if it is no valid pose."""
         for stamped in msg.transforms:
             parent, child = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
             t, q = stamped.transform.translation, stamped.transform.rotation

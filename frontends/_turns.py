@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Consistency of headings with the gyroscope and with each other. The solver trusts both and would blame the IMU's noise."""
+"""Consistency of headings with the gyroscope and with each other.
+
+The solver trusts headings and gyroscope; where they contradict each other it would blame the noise of the IMU.
+"""
 
 from __future__ import annotations
 
@@ -17,39 +20,47 @@ from graphloc.measurements import CompassHeading, ImuSeries
 from graphloc.signals.series import integral, rms
 from graphloc.time import NS_PER_S, stamps_of
 
-_BLOCK_S = 120.0  # within it a gyro's bias and a compass's offset are steady
+_BLOCK_S = 120.0  # duration of a block, in which a gyro's bias and a compass's offset are steady
 _HOLE_S, _STEP_S = 0.5, 2.0
-_TURNS_DEG = 5.0  # RMS of the turns in 2 s, or all in all, from which they tell
-_CLEAR = 0.5  # correlation
-_LIKELY = 2.0  # of the fastest turn by the gyro
+_TURNS_DEG = 5.0  # least RMS of turns that tell, of a block's turn about a line, or of changes within `_LONG_S`
+_CLEAR = 0.5  # negative correlation of steps from which headings turn against the gyro
+_LIKELY = 2.0  # a step of the heading beyond so many times the largest step by the gyro is a false heading
 _NEAR_S, _ASKED, _FEW, _LOST_DEG = 2.0, 20, 3, 30.0
-"""Headings within `_NEAR_S`, the next `_ASKED` to either side at most and `_FEW` at least, are asked whether they agree: a
-bias of 3 deg/s is 6 deg by then, a craft in a sharp turn 30 deg off what it was."""
-_LEAP_DEG, _SMOOTH_DEG = 120.0, 15.0  # beyond the one, which way it turned is a guess; RMS from a steady turn
+"""A heading is compared with the next `_ASKED` headings to either side within `_NEAR_S`; with fewer than `_FEW` it is
+kept. By then a bias of 3 deg/s makes 6 deg, and a craft in a sharp turn has turned by 30 deg, hence `_LOST_DEG`."""
+# A larger step does not tell which way the craft turned; largest RMS about a steady turn of headings that are kept.
+_LEAP_DEG, _SMOOTH_DEG = 120.0, 15.0
 SCATTERED = (
     "differs from most headings around it, with and without the gyro: a course over ground at rest is no heading"
 )
-_TILT_S, _UPRIGHT_RAD = 5.0, 0.8  # a wave lasts less; a craft is seldom tilted by more
+# Tilt: crossover time from gyroscope to accelerometer, longer than a wave; a craft is seldom tilted by more.
+_TILT_S, _UPRIGHT_RAD = 5.0, 0.8
 WANDERS_DEG = 1.0
-"""Of a compass beside the gyroscope: above it there is more than such a comparison errs by."""
+"""Least wander of a compass beside the gyroscope that is said, 1 sigma: a smaller one may be the comparison's error."""
 _CELL_S, _WANDER_BLOCK_S, _LONG_BLOCK_S, _LAGS_S, _MINUTE_S = 2.0, 300.0, 60.0, (4.0, 24.0), 60.0
-"""Headings are averaged over the first; of blocks as long as the second, changes over the third are compared."""
+"""For the wander: cells over which headings are averaged; longest and shortest block; lags over which changes are
+compared; correlation time to which the wander refers."""
 _BENDS, _BENDS_S = 0.5, 180.0
-"""Of a wander about a line, below which what is left about a parabola is taken for it; in a run of at least this time, three times that a wander lasts."""
-_SCALE = 1.6  # of the ranges of a gyroscope each is twice the next; a compass in iron turns by a third too much
+"""The wander about a parabola is taken if it is below this share of that about a line, in a run of at least this time:
+three correlation times of a wander."""
+# Least wrong scale that is said: ranges of a gyroscope differ by a factor of 2, a compass in iron turns a third too
+# much.
+_SCALE = 1.6
 Yaws = tuple[NDArray[np.int64], Array]  # stamps (N,), ns, and yaw (N,), rad
-_PART_DEG, _PART = 3.0, 3.0  # least RMS that is said; times the sigma that is claimed
-_LONG_S = 12.0  # over which courses are no noise (as in `_assess_imu.py`)
+_PART_DEG, _PART = 3.0, 3.0  # RMS from which a deviation is said: in deg, and as a multiple of the claimed sigma
+_LONG_S = 12.0  # time over which a change of course is no noise (as in `_assess_imu.py`)
 _UNIT, _UNIT_CLEAR, _BY_CHANCE = 2.3, 0.8, 5.0
-"""Turns are another unit's within this factor; correlation, and that over what it is by chance (Student's t), from which that is clear."""
+"""Turns fit a unit if their ratio is right within this factor; they are clear from this correlation and this value
+of Student's t, which says how far the correlation is beyond chance."""
 
 
 def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading], convention: str) -> list[str]:
-    """Return a line if headings turn against the gyroscope, or deviate from it by far more than they claim.
+    """Return a warning if headings turn against the gyroscope, or deviate from it by far more than they claim.
 
     The vertical is the median acceleration, so no mount is needed; an IMU without gravity gives no warning.
 
     Args:
+        imu: the samples. sensor: name of the compass.
         headings: of one compass, converted as configured. convention: the configured one.
     """
     against, apart = _compared(imu, _said(headings))
@@ -70,7 +81,7 @@ def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading
 
 
 def pose_turn_warning(imu: ImuSeries, sensor: str, yaws: Yaws) -> list[str]:
-    """Return a line if the yaws of poses turn against the gyroscope, as those in north, east, down do."""
+    """Return a warning if the yaws of poses turn against the gyroscope, as yaws of a north, east, down frame do."""
     if not _compared(imu, yaws)[0]:
         return []
     said = f"{sensor}: its yaw turns the other way than {imu.sensor}, levelled by its own gravity: its frame is not east, north, up"
@@ -80,7 +91,10 @@ def pose_turn_warning(imu: ImuSeries, sensor: str, yaws: Yaws) -> list[str]:
 
 
 def _compared(imu: ImuSeries, yaws: Yaws) -> tuple[bool, list[Array]]:
-    """Return whether yaws turn against the gyroscope, and by block how far they are off its turn, rad; none if there is hardly a turn."""
+    """Return whether yaws turn against the gyroscope, and by block yaw minus turn, about a straight line, rad.
+
+    Without clear turns: False, and no blocks.
+    """
     together, power, apart, turns = 0.0, 0.0, [], []
     for _, turned, yaw, at_s in _blocks(imu, yaws):
         if len(at_s) < 20:
@@ -89,7 +103,7 @@ def _compared(imu: ImuSeries, yaws: Yaws) -> tuple[bool, list[Array]]:
         if step >= len(at_s):
             continue
         by_gyro, by_yaw = turned[step:] - turned[:-step], wrap_angle(yaw[step:] - yaw[:-step])
-        likely = np.abs(by_yaw) <= _LIKELY * np.abs(by_gyro).max()  # without most of false matches
+        likely = np.abs(by_yaw) <= _LIKELY * np.abs(by_gyro).max()  # leaves out most false matches
         by_gyro, by_yaw = by_gyro[likely], by_yaw[likely]
         together += float((by_gyro * by_yaw).sum())
         power += float(np.sqrt((by_gyro**2).sum() * (by_yaw**2).sum()))
@@ -101,24 +115,25 @@ def _compared(imu: ImuSeries, yaws: Yaws) -> tuple[bool, list[Array]]:
 
 
 def without_line(values: Array, at_s: Array, *columns: Array) -> Array:
-    """Return values (N,) less their best fit by a straight line in time, at_s (N,), s, and by other columns (N,)."""
+    """Return the residuals of values (N,) about a least-squares line in time, at_s (N,), s, and other columns (N,)."""
     line = np.column_stack([np.ones(len(at_s)), at_s - at_s.mean(), *columns])
     return np.asarray(values - line @ np.linalg.lstsq(line, values, rcond=None)[0])
 
 
 def refuse_unit(imu: ImuSeries, config: ImuConfig, yaws_by_source: Mapping[str, Yaws]) -> bool:
-    """Refuse rates in another unit than configured: they turn by 57 times too little or too much, compared with headings.
+    """Refuse rates in another unit than configured: beside headings they turn 57 times too little or too much.
 
     The solver would take the missing part of a turn for a bias, and the heading for known.
 
     Args:
+        imu: samples, converted as configured. config: of the IMU.
         yaws_by_source: headings or courses, by their name in the message.
 
     Returns:
-        Whether rates turn as some of these do, as configured.
+        Whether rates, as configured, turn as some of the headings or courses do.
 
     Raises:
-        InputError: they are.
+        InputError: the rates are in the other unit.
     """
     wrong, right = ("less", "rad/s") if config.gyro_unit == "deg/s" else ("more", "deg/s")
     other = np.degrees(1.0) if wrong == "less" else np.radians(1.0)
@@ -135,7 +150,11 @@ def refuse_unit(imu: ImuSeries, config: ImuConfig, yaws_by_source: Mapping[str, 
 
 
 def unit_of_turns(imu: ImuSeries, yaws: Yaws) -> Literal["rad/s", "deg/s"] | None:
-    """Return the unit in which rates turn as headings or courses do; None where these tell neither."""
+    """Return the unit in which rates turn as headings or courses do; None if neither is clear.
+
+    Args:
+        imu: rates as they are told. yaws: headings or courses.
+    """
     times = _times_turned(imu, yaws)
     if _alike(times, 1.0):
         return "rad/s"
@@ -147,7 +166,10 @@ def _alike(times: float, expected: float) -> bool:
 
 
 def scale_warning(imu: ImuSeries, sensor: str, yaws: Yaws) -> list[str]:
-    """Return a line if yaws turn in step with the gyroscope, but clearly more or less: a driver that has its range, or a unit of its own."""
+    """Return a warning if yaws turn in step with the gyroscope, but clearly more or less.
+
+    Then its driver takes a wrong range of the gyroscope, or has a unit of its own.
+    """
     times = _times_turned(imu, yaws)
     if times == 0.0 or 1.0 / _SCALE < times < _SCALE:
         return []
@@ -159,7 +181,7 @@ def scale_warning(imu: ImuSeries, sensor: str, yaws: Yaws) -> list[str]:
 
 
 def _times_turned(imu: ImuSeries, yaws: Yaws) -> float:
-    """Return the ratio of the turn by headings to that by the gyroscope, unsigned; 0 if they are not clearly correlated."""
+    """Return the unsigned ratio of turns by headings to turns by the gyroscope; 0 if they do not clearly correlate."""
     by_gyro, by_heading, alone = [np.zeros(0)], [np.zeros(0)], 0.0
     for _, turned, yaw, at_s in _blocks(imu, yaws):
         if len(at_s) < 20 or at_s[-1] - at_s[0] <= _LONG_S:
@@ -172,7 +194,7 @@ def _times_turned(imu: ImuSeries, yaws: Yaws) -> float:
     a, b = np.concatenate(by_gyro), np.concatenate(by_heading)
     if alone <= 2.0:
         return 0.0
-    a, b = a - a.mean(), b - b.mean()  # a gyro's bias is in the mean
+    a, b = a - a.mean(), b - b.mean()  # removes the gyro's bias
     largest = max(rms(a), rms(b))
     power = float(np.sqrt((a**2).sum() * (b**2).sum()))
     if np.degrees(largest) < _TURNS_DEG or power == 0.0:
@@ -184,19 +206,24 @@ def _times_turned(imu: ImuSeries, yaws: Yaws) -> float:
 
 
 def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | None:
-    """Return a compass's wander against the gyroscope, 1 sigma, deg, at a correlation time of a minute; None of a short run.
+    """Return a compass's wander against the gyroscope, 1 sigma, deg, at a correlation time of a minute.
 
-    Of heading minus integrated rate, a straight line per block (offset, bias) and the parts proportional to heading (deviation),
-    turn (scale) and rate (delay) are removed. If the rest diffuses, its mean square step grows by q t from some seconds to half a
-    minute, on top of white noise. For a first-order Gauss-Markov process, q = 2 sigma^2 / tau.
+    From heading minus integrated rate, a straight line per block (offset, bias) and parts proportional to sines and
+    cosines of the heading (deviation), turn (scale) and rate (delay) are removed. If the residual diffuses, its mean
+    square step grows by q t from some seconds to half a minute, on top of white noise. For a first-order Gauss-Markov
+    process, q = 2 sigma^2 / tau.
 
-    What is removed takes part of the wander along, in a run of 90 s two thirds of it, which is known and made up for.
+    The removal takes along part of the wander, two thirds in a run of 90 s; this part is computed and compensated.
 
-    A gyroscope that warms up bends what the line is taken off: where a parabola leaves less than half of it, that is the wander. By less, or
-    in a shorter time, a wander bends by itself.
+    The changing bias of a gyroscope that warms up bends the difference. So the wander about a parabola is taken instead
+    if it is less than half of that about a line. In a run of under three minutes it is not, since a wander itself
+    bends.
 
     Args:
-        headings: of one compass, converted as configured.
+        imu: the samples. headings: of one compass, converted as configured.
+
+    Returns:
+        None of a run without a block of a minute.
     """
     by_line = _wander_beside(imu, headings, 1)
     if by_line is None or (headings[-1].stamp_ns - headings[0].stamp_ns) / NS_PER_S < _BENDS_S:
@@ -206,8 +233,8 @@ def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | No
 
 
 def _wander_beside(imu: ImuSeries, headings: Sequence[CompassHeading], degree: int) -> float | None:
-    """Return the same with a polynomial of a degree taken off each block."""
-    blocks, first = [], degree + 1  # column after the polynomial's
+    """Return the wander of `wander_deg`, with a polynomial of a degree removed from each block; None without blocks."""
+    blocks, first = [], degree + 1  # index of the first column after the polynomial's
     for _, turned, yaw, at_s in _blocks(imu, _said(headings), _WANDER_BLOCK_S):
         cell = ((at_s - at_s[0]) // _CELL_S).astype(int)
         if cell[-1] * _CELL_S < _LONG_BLOCK_S:
@@ -216,7 +243,7 @@ def _wander_beside(imu: ImuSeries, headings: Sequence[CompassHeading], degree: i
         apart = np.unwrap(yaw - turned)
         middle = (at_s - at_s.mean()) / _WANDER_BLOCK_S
         columns = [*(middle**k for k in range(first)), turned, np.gradient(turned, at_s), apart]
-        # The heading by the gyroscope, its bias taken off: by the compass itself, its error would explain itself.
+        # Deviation by the heading of the gyroscope, without its bias: by that of the compass, an error explains itself.
         along = turned + np.polyval(np.polyfit(middle, apart, degree), middle)
         columns += [f(k * along) for k in (1.0, 2.0) for f in (np.sin, np.cos)]
         means = [np.bincount(cell, column)[there] / count for column in columns]
@@ -233,7 +260,8 @@ def _wander_beside(imu: ImuSeries, headings: Sequence[CompassHeading], degree: i
     wander = float(np.degrees(np.sqrt(0.5 * grown / (_LAGS_S[1] - _LAGS_S[0]) * _MINUTE_S)))
     cells = [own for own, _ in blocks]
     by_steps = grown / _grown_of_unit(cells, _left_of_unit(cells, design))
-    # No wander scatters by less about that than it should; what swings evenly only looks as if much had been taken off.
+    # A real wander scatters about the polynomials as much as it should. A periodic error scatters less, and its steps
+    # are not compensated for a removal.
     off_bend = apart - bends @ np.linalg.lstsq(bends, apart, rcond=1e-6)[0]
     left_of_unit = np.concatenate([cov.diagonal() for cov in _left_of_unit(cells, bends)])
     by_spread = float((off_bend**2).mean() / left_of_unit.mean())
@@ -241,12 +269,13 @@ def _wander_beside(imu: ImuSeries, headings: Sequence[CompassHeading], degree: i
 
 
 def _left_of_unit(cells: Sequence[NDArray[np.intp]], design: Array) -> list[Array]:
-    """Return the covariance (n, n) of each block that a wander of 1 rad in a minute has left once `design` is removed from it.
+    """Return the covariance (n, n) of each block's residuals of a wander of 1 rad and one minute, about `design`.
 
-    The residuals r = M e of errors e with covariance C, M = I - Q Q^T, have the covariance M C M; of C only blocks are not 0.
+    Errors e with covariance C have the residuals r = M e with M = I - Q Q^T, where Q is an orthonormal basis of the
+    columns of `design`. The covariance of r is M C M. C is block diagonal: a block of C is exp(-t / tau).
 
     Args:
-        cells: (n,) of each block. design: (N, k); Q is an orthonormal base of it.
+        cells: (n,) cell numbers of each block, N in all. design: (N, k) columns that are removed.
     """
     left, size, _ = np.linalg.svd(design, full_matrices=False)
     base = np.split(left[:, size > 1e-6 * size[0]], np.cumsum([len(own) for own in cells])[:-1])
@@ -257,7 +286,11 @@ def _left_of_unit(cells: Sequence[NDArray[np.intp]], design: Array) -> list[Arra
 
 
 def _grown_of_unit(cells: Sequence[NDArray[np.intp]], covs: Sequence[Array]) -> float:
-    """Return by how much the mean square step of residuals with such covariances grows from the shorter lag to the longer one."""
+    """Return the growth of the mean square step from the shorter lag to the longer one, of residuals with `covs`.
+
+    Args:
+        cells: (n,) cell numbers of each block. covs: (n, n) covariance of the residuals of each block.
+    """
     soon: list[Array] = []
     late: list[Array] = []
     for own, cov in zip(cells, covs, strict=True):
@@ -268,7 +301,7 @@ def _grown_of_unit(cells: Sequence[NDArray[np.intp]], covs: Sequence[Array]) -> 
 
 
 def wander_warning(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading], config: CompassConfig) -> list[str]:
-    """Return a line if a compass wanders by far more than configured: the bounds of the heading would be too small."""
+    """Return a warning if a compass wanders far more than configured: the bounds of the heading would be too small."""
     found = wander_deg(imu, headings)
     if found is None or found < max(WANDERS_DEG, 2.0 * config.wander_sigma_deg):
         return []
@@ -279,7 +312,7 @@ def wander_warning(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeadin
 
 
 def _squared_steps(blocks: Sequence[tuple[NDArray[np.intp], Array]], left: Sequence[Array], steps: int) -> float:
-    """Return the mean square of changes over some cells."""
+    """Return the mean square change of residuals over a number of cells, within blocks."""
     changes = [np.zeros(0)]
     for (cells, _), rest in zip(blocks, left, strict=True):
         along = np.full(int(cells[-1]) + 1, np.nan)
@@ -289,10 +322,12 @@ def _squared_steps(blocks: Sequence[tuple[NDArray[np.intp], Array]], left: Seque
 
 
 def scattered(imu: ImuSeries, headings: Sequence[CompassHeading]) -> NDArray[np.bool_]:
-    """Return (N,) which headings agree with fewer than half of their neighbours, with or without the gyroscope's turn.
+    """Return (N,) which headings agree with fewer than half of their neighbours, with and without the gyroscope's turn.
 
-    Such are headings that a receiver derives from its motion while it has none: each claims to be good to a degree or two. Headings
-    that only the gyroscope contradicts are kept, pivots included: its unit, or the headings' convention, may be wrong.
+    Such are headings that a receiver derives from its motion while it stands: each claims to be good to a degree or
+    two.
+    Headings that only the gyroscope contradicts are kept, also those of a pivot: the unit of the gyroscope, or the
+    convention of the headings, may be wrong.
     """
     bad = np.zeros(len(headings), dtype=bool)
     for own, turned, yaw, at_s in _blocks(imu, _said(headings)):
@@ -309,7 +344,7 @@ def scattered(imu: ImuSeries, headings: Sequence[CompassHeading]) -> NDArray[np.
 
 
 def _smooth(yaw: Array, at_s: Array) -> NDArray[np.bool_]:
-    """Return (N,) which headings fit a steady turn within `_NEAR_S` to either side, without the gyroscope."""
+    """Return (N,) which headings fit a steady turn within `_NEAR_S` to either side, whatever the gyroscope says."""
     steps = wrap_angle(np.diff(yaw))
     way = np.concatenate([[0.0], np.cumsum(steps)])
     too_far = np.concatenate([[0], np.cumsum(np.abs(steps) > np.radians(_LEAP_DEG))])
@@ -323,13 +358,14 @@ def _smooth(yaw: Array, at_s: Array) -> NDArray[np.bool_]:
 
 
 def yaw_rate(t_s: Array, accel_mps2: Array, gyro_radps: Array, up: Array) -> Array:
-    """Return how fast (N,), rad/s, the yaw changes of a craft that rolls and pitches: (q sin(roll) + r cos(roll)) / cos(pitch).
+    """Return the yaw rate (N,), rad/s, of a craft that rolls and pitches: (q sin(roll) + r cos(roll)) / cos(pitch).
 
-    Roll and pitch are those of the gyroscope within `_TILT_S`, and of the accelerometer beyond. The rate about the mean vertical alone goes off by
-    half of the area that the two enclose, each wave: of 8 and 4 deg by degrees a minute, and by another rate in each group of waves.
+    Roll and pitch are by the gyroscope for times shorter than `_TILT_S`, and by the accelerometer for longer ones. The
+    integrated rate about the mean vertical would drift, each wave, by half of the area that roll and pitch enclose: of
+    8 and 4 deg by degrees a minute, and differently in each group of waves.
 
     Args:
-        t_s: (N,). accel_mps2, gyro_radps: (N, 3), in any axes. up: (3,) the vertical in these, on average.
+        t_s: (N,), s. accel_mps2, gyro_radps: (N, 3), in any axes. up: (3,) mean vertical in the same axes, any length.
     """
     z = up / np.linalg.norm(up)
     x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
@@ -337,18 +373,21 @@ def yaw_rate(t_s: Array, accel_mps2: Array, gyro_radps: Array, up: Array) -> Arr
     level = np.column_stack([x, np.cross(z, x), z])
     p, q, r = (gyro_radps @ level).T
     f = accel_mps2 @ level
-    # Of an IMU that stands a little askew on the way, and of rates that carry a bias: both are slow.
+    # The accelerometer removes what is slow: a bias of the rates, and a mean vertical that is a little askew.
     roll, pitch = (
         _joined(t_s, rate, felt)
         for rate, felt in ((p, np.arctan2(f[:, 1], f[:, 2])), (q, np.arctan2(-f[:, 0], np.hypot(f[:, 1], f[:, 2]))))
     )
     if max(float(np.quantile(np.abs(angle), 0.95)) for angle in (roll, pitch)) > _UPRIGHT_RAD:
-        return np.asarray(r)  # rates in another unit, or a camera in the hand
+        return np.asarray(r)  # no upright craft: rates in another unit, or a hand-held camera
     return np.asarray((q * np.sin(roll) + r * np.cos(roll)) / np.cos(pitch))
 
 
 def _joined(t_s: Array, rate: Array, slow: Array) -> Array:
-    """Return an angle (N,), rad, whose changes within `_TILT_S` are those of a rate (N,), and the others those of another angle (N,)."""
+    """Return a complementary filter's angle (N,), rad: fast changes by a rate (N,), slow ones by an angle (N,).
+
+    The crossover time is `_TILT_S`.
+    """
     from scipy.signal import lfilter  # brings scipy.stats: a fifth of what most commands need to begin
 
     steps = np.diff(t_s)
@@ -368,9 +407,10 @@ def _said(headings: Sequence[CompassHeading]) -> Yaws:
 def _blocks(
     imu: ImuSeries, yaws: Yaws, block_s: float = _BLOCK_S
 ) -> Iterator[tuple[NDArray[np.intp], Array, Array, Array]]:
-    """Yield for each block without an IMU gap: indices into `yaws`, turn by the gyroscope, yaw, and time (s), increasing.
+    """Yield for each block without an IMU gap: indices into `yaws`, integrated yaw rate, yaw (rad), and time (s).
 
-    Of yaws with one stamp (a clock that was set back by whole seconds) the first is taken.
+    Times increase. Of yaws with equal stamps (of a clock that was set back by whole seconds) the first is taken.
+    Nothing is yielded without gravity, or of fewer than 20 yaws.
     """
     up = np.median(imu.accel_mps2, axis=0) if len(imu.stamps_ns) else np.zeros(3)
     if float(np.linalg.norm(up)) < 5.0 or len(yaws[0]) < 20:  # m/s^2: no gravity in it

@@ -98,7 +98,10 @@ class MessageTypes:
         self._stores: dict[str, list[Typestore]] = {}
 
     def decode(self, data: bytes, msgtype: str) -> object:
-        """Return the deserialised message; of Livox's scans, as the cloud that they are. Raises whatever rosbags raises on damaged bytes."""
+        """Return the deserialised message, a scan of Livox as a cloud.
+
+        Raises whatever rosbags raises on damaged bytes.
+        """
         if msgtype in LIVOX:
             return livox_cloud(data, ros1=self._ros1)
         if msgtype not in self._stores:
@@ -107,18 +110,18 @@ class MessageTypes:
         for store in others:
             try:
                 msg = self._with(store, data, msgtype)
-            except Exception:  # noqa: BLE001, S112 - a version that it is not may raise nearly anything
+            except Exception:  # noqa: BLE001, S112 - a wrong version may raise nearly anything
                 continue
             self._stores[msgtype] = [store]
             return msg
         return self._with(last, data, msgtype)
 
     def _with(self, store: Typestore, data: bytes, msgtype: str) -> object:
-        store.max_sequence_length = len(data) or 1  # of what takes no bytes there could be 2^32
+        store.max_sequence_length = len(data) or 1  # a damaged length may state 2^32 elements that take no bytes
         return (store.deserialize_ros1 if self._ros1 else store.deserialize_cdr)(data, msgtype)
 
     def _stores_of(self, msgtype: str) -> list[Typestore]:
-        """Return the definition of the type in the bag, if it has one, else the standard one; of a maker's, those of its versions."""
+        """Return stores with the definition of a type in the bag; else with the standard one, or all of a maker's."""
         definitions = (c.msgdef for c in self._connections if c.msgtype == msgtype)
         for definition in definitions:
             if definition.format == MessageDefinitionFormat.NONE:
@@ -139,7 +142,7 @@ class MessageTypes:
 
 @lru_cache(maxsize=64)  # as `_defined`
 def _known(text: str, msgtype: str, ros1: bool) -> Typestore:
-    """Return the standard definitions, and one of ours beside them, if any."""
+    """Return the standard definitions, with one of ours added, if any."""
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
     if text:
         store.register(get_types_from_msg(text, msgtype))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of u-blox.
 
-`ublox_msgs` with the manual's names of fields in ROS 1, in lower case in ROS 2, `ublox_ubx_msgs` with flags of their own, and `gnss_comm`,
-in units of ROS.
+`ublox_msgs` with the manual's names of fields in ROS 1, in lower case in ROS 2, `ublox_ubx_msgs` with flags of their
+own, and `gnss_comm`, in units of ROS.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _UBX_FIX_OK, _UBX_DIFFERENTIAL = 1, 2
 _UBX_TIME_VALID = 3
 _UBX_2D, _UBX_FIXES = 2, (2, 3, 4)
 _UBX_VALID, _UBX_MOVING, _UBX_HEADING = 0x05, 0x20, 0x100  # of a relative position; that its base moves; of its heading
-_UBX_FIXED = 2  # ambiguities; 1: float
+_UBX_FIXED = 2  # fixed ambiguities; 1: float
 
 
 def _ubx_fix(msg: Any) -> tuple[int, bool]:
-    """Type of fix, and whether it is good enough."""
+    """Return the type of fix, and whether it is valid."""
     if hasattr(msg, "gps_fix"):
         return int(msg.gps_fix.fix_type), bool(msg.gnss_fix_ok) and not msg.invalid_llh
     if hasattr(msg, "valid_fix"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag lacks, topics of IMUs, receivers, magnetometers and speeds in it that are not used, with reasons, and those that sensors share."""
+"""Warnings of `inspect`: sensors that a bag lacks, topics that are not used, with reasons, and shared topics."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from graphloc.frontends.source import TopicSummary
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")
 _MOST_NAMED = 6
 _OF_A_SENSOR = (IMU, *FIX_TYPES, TWIST, QUATERNION)
-_SHARE = 0.05  # of the messages of a topic, above which what they name is no mistake
+_SHARE = 0.05  # least share of a topic's messages that name a frame for it to count
 _MAGNETIC = "sensor_msgs/msg/MagneticField"
-# Packets and clouds in a maker's own types, and scans of a plane; lists of tags other than `LISTS`.
+# Types of packets and clouds of makers, and of scans of a plane; then of lists of tags other than `LISTS`.
 _LIDAR = re.compile(r"LaserScan|livox|velodyne|ouster|pandar|hesai|rslidar|robosense|lidar", re.IGNORECASE)
 _TAGS = re.compile(r"april|aruco|fiducial|CompressedVideo|FFMPEGPacket|theora", re.IGNORECASE)
 _SPEED = re.compile(r"speed|stw|sog|knots|velocity", re.IGNORECASE)
@@ -31,7 +31,7 @@ _SPEED = re.compile(r"speed|stw|sog|knots|velocity", re.IGNORECASE)
 def lacking(
     bag: Contents, imus: Sequence[ImuReport], gnss: Sequence[GnssReport], odometry: Sequence[OdometryReport]
 ) -> list[str]:
-    """Say which required sensors are missing, and then also which topics have an unsupported type: they may be it."""
+    """Return warnings on required sensors that are missing, and then on topics of unsupported types: maybe these."""
     poses = [report.topic for report in odometry if report.role == "pose"]
     placed = gnss or bag.cameras or any(report.grid for report in odometry)
     lines = []
@@ -51,7 +51,7 @@ def lacking(
 
 
 def _of_other_types(bag: Contents) -> list[str]:
-    """Return a line on the topics of types that are neither read here nor known for something else."""
+    """Return a warning on the topics of types that are neither read nor known for something else."""
     read = {
         *(bare_topic(name) for name in bag.streams),
         *bag.lidars,
@@ -67,7 +67,7 @@ def _of_other_types(bag: Contents) -> list[str]:
 
 
 def unused_topics(streams: Sequence[TopicData], used: Container[str], messages: int) -> list[str]:
-    """Return a line for each IMU and GNSS topic that is not used, with the reason: otherwise they would seem to be missing.
+    """Return a line on each IMU and GNSS topic that is not used, with the reason: else it would seem to be missing.
 
     Args:
         messages: how many the bag holds, of any type.
@@ -93,10 +93,10 @@ def unused_topics(streams: Sequence[TopicData], used: Container[str], messages: 
 
 
 def shared_topics(streams: Sequence[TopicData]) -> list[str]:
-    """Return a line for each topic on which several sensors are, by the frames that its messages name."""
+    """Return a warning on each topic that several sensors share, by the frames that its messages name."""
     lines = {}
     for stream in streams:
-        # Of poses it is the frame that they are in.
+        # Poses name the frame in which they are, not the sensor's.
         if stream.msgtype not in _OF_A_SENSOR:
             continue
         topic = bare_topic(stream.topic)
@@ -111,7 +111,7 @@ def shared_topics(streams: Sequence[TopicData]) -> list[str]:
 
 
 def unused_magnetometers(topics: Iterable[TopicSummary]) -> list[str]:
-    """Return a line for each magnetometer of a bag without a compass: what makes one of it."""
+    """Return a line on each magnetometer of a bag without a compass: how it can become a compass."""
     return [
         f"{t.topic}: a magnetic field is not read, and nothing else tells the heading but the motion; a filter such as "
         "imu_filter_madgwick makes an orientation of it, which is read as a compass"
@@ -121,20 +121,20 @@ def unused_magnetometers(topics: Iterable[TopicSummary]) -> list[str]:
 
 
 def unread_lidars(topics: Iterable[TopicSummary]) -> list[str]:
-    """Return a line for each topic of a bag without a scan that is read that holds scans in another type."""
+    """Return a line on each topic with scans in an unread type, of a bag without readable scans."""
     return _unread(
         topics, _LIDAR, "scans are read as sensor_msgs/PointCloud2, which its driver, or a converter, makes of it"
     )
 
 
 def unread_tags(topics: Iterable[TopicSummary]) -> list[str]:
-    """Return a line for each topic of a bag without images or known lists that holds tags, or video, in another type."""
+    """Return a line on each topic with tags or video in an unread type, of a bag without images or known lists."""
     images = "tags are found in images (sensor_msgs/Image, CompressedImage)"
     return _unread(topics, _TAGS, f"{images}, or read as apriltag_msgs/AprilTagDetectionArray")
 
 
 def _unread(topics: Iterable[TopicSummary], kinds: re.Pattern[str], how: str) -> list[str]:
-    """Return a line for each topic with messages of types like these; `how`: in which form they would be read."""
+    """Return a line on each topic whose type matches a pattern; `how`: in which form its content would be read."""
     return [
         f"{t.topic}: {either(t.msgtypes)} is not read; {how}"
         for t in topics
@@ -143,7 +143,10 @@ def _unread(topics: Iterable[TopicSummary], kinds: re.Pattern[str], how: str) ->
 
 
 def unused_numbers(topics: Iterable[TopicSummary]) -> list[str]:
-    """Return a line for each topic of numbers that may be a speed, by its name: the unit is not in the bag, so none is drafted."""
+    """Return a line on each topic of numbers that, by its name, may be a speed.
+
+    The unit is not in the bag, so no sensor is drafted.
+    """
     return [
         f"{t.topic}: its numbers look like a speed by their name; where it is one along the vessel, a sensor of kind body_velocity "
         "reads it (unit: m/s, km/h or knots; through: water for a speed log)"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What makers' messages say, as plain values, and what several makers have alike: sigmas, headings, GPS time."""
+"""What makers' messages say, as plain values, and what several makers share: sigmas, headings, GPS time."""
 
 from __future__ import annotations
 
@@ -21,9 +21,12 @@ class SaidInertial(NamedTuple):
 
 
 class SaidPlace(NamedTuple):
-    """A fix: degrees and height above the ellipsoid, m (NaN: not measured); status as in `NavSatStatus`.
+    """A fix.
 
-    horizontal_m, vertical_m: sigmas of each axis; 0: not told. filtered: whether a filter made it of several sensors, as of what follows.
+    Attributes:
+        latitude_deg, longitude_deg, height_m: position, height above the ellipsoid, NaN if not measured.
+        status: as in `NavSatStatus`. horizontal_m, vertical_m: sigma of an axis; 0 if not told.
+        filtered: whether a filter made it from several sensors.
     """
 
     latitude_deg: float
@@ -36,7 +39,7 @@ class SaidPlace(NamedTuple):
 
 
 class SaidVelocity(NamedTuple):
-    """A velocity over ground, m/s, and sigmas, horizontal and vertical; 0: not told."""
+    """A velocity over ground, its horizontal and vertical sigma (0 if not told), and whether a filter made it."""
 
     v_mps: tuple[float, float, float]
     horizontal_mps: float = 0.0
@@ -45,7 +48,7 @@ class SaidVelocity(NamedTuple):
 
 
 class SaidHeading(NamedTuple):
-    """A direction, rad, and its sigma; 0: not told."""
+    """A heading or yaw, its sigma (0 if not told), and whether a filter made it."""
 
     angle_rad: float
     sigma_rad: float = 0.0
@@ -53,7 +56,12 @@ class SaidHeading(NamedTuple):
 
 
 class SaidAlong(NamedTuple):
-    """A velocity along the axes of the sensor, m/s, its covariance, row by row (0: not told), and through what: ground, water, or not told."""
+    """A velocity along the axes of the sensor.
+
+    Attributes:
+        v_mps, covariance: velocity; its covariance, 9 values, row by row, 0 if not told.
+        through: 'ground' or 'water'; '' if not told.
+    """
 
     v_mps: tuple[float, float, float]
     covariance: tuple[float, ...]
@@ -68,9 +76,11 @@ class Part(NamedTuple):
     """One of the things that a type of message says.
 
     Attributes:
-        kind: the kind of sensor that reads it. read: takes the message. told: whether its axes are known by the type; else `convention`
-            tells them, and `usual` is that of a driver that is left as it comes. antennas: whether a heading is one of GNSS, not of a filter.
-        through: whether each message says if its velocity is over ground or through the water.
+        kind: kind of sensor that reads it. read: returns it from a message, or why there is none.
+        told: whether the type fixes its axes; else `convention` of the sensor tells them.
+        antennas: whether a heading is by two GNSS antennas, not by a filter.
+        usual: convention of the driver by default. through: whether each message says if its velocity is over ground or
+            through the water.
     """
 
     kind: str
@@ -81,11 +91,11 @@ class Part(NamedTuple):
     through: bool = False
 
 
-_FEWEST_M, _MOST_M = 1e-4, 1e3  # sigmas of a fix that are believed; a receiver that knows its place no better has none
-DO_NOT_USE = 1e9  # Septentrio's value for 'not told' is -2e10; in axes of ROS its driver turns it
+_FEWEST_M, _MOST_M = 1e-4, 1e3  # a smaller sigma of a fix is unknown; with a larger one there is no fix
+DO_NOT_USE = 1e9  # larger values mean 'not told': Septentrio has -2e10, whose sign its driver may turn
 _WEEK_NS = 7 * 86_400 * NS_PER_S
 _GPS_EPOCH_NS = 315_964_800 * NS_PER_S  # 1980-01-06
-# GPS time minus UTC, s, from a date on. None was announced after 2017.
+# From a date on, GPS time minus UTC, s. No leap second was announced after 2017.
 _LEAPS = tuple(
     (int(datetime(year, month, 1, tzinfo=UTC).timestamp()) * NS_PER_S, leap_s)
     for year, month, leap_s in ((2017, 1, 18), (2015, 7, 17), (2012, 7, 16), (1980, 1, 15))
@@ -93,7 +103,10 @@ _LEAPS = tuple(
 
 
 def gps_stamp_ns(tow_ms: int, log_ns: int) -> int:
-    """Return the UTC of a GPS time of week, in the week that is nearest to the recording time; the latter where that has no date."""
+    """Return the UTC of a GPS time of week, in the week that is nearest to the recording time.
+
+    If the recording time has no date, the recording time itself.
+    """
     if log_ns < NO_DATE_NS:
         return log_ns
     leap_ns = next(leap_s for since_ns, leap_s in _LEAPS if log_ns >= since_ns) * NS_PER_S
@@ -102,7 +115,10 @@ def gps_stamp_ns(tow_ms: int, log_ns: int) -> int:
 
 
 def week_stamp_ns(week: int, tow_ms: int, log_ns: int) -> int:
-    """Return the UTC of a GPS week and time of week; of a week that is none, as before a receiver knows it, that by the recording time."""
+    """Return the UTC of a GPS week and time of week.
+
+    If the week is invalid, as before a receiver knows it, it is the one nearest to the recording time.
+    """
     told_ns = _GPS_EPOCH_NS + week * _WEEK_NS + tow_ms * 1_000_000
     return gps_stamp_ns(tow_ms, told_ns if told_ns >= NO_DATE_NS else log_ns)
 
@@ -112,7 +128,7 @@ def xyz_of(v: Any) -> tuple[float, float, float]:
 
 
 def field_of(msg: Any, *names: str) -> Any:
-    """Return the first of some fields that the message has: their names changed with the version of a driver."""
+    """Return the first of several fields that a message has: names changed with versions of the driver."""
     for name in names:
         if hasattr(msg, name):
             return getattr(msg, name)
@@ -120,19 +136,19 @@ def field_of(msg: Any, *names: str) -> Any:
 
 
 def sigma_of(sigma: float) -> float:
-    """Return a sigma, 0 where it is none."""
+    """Return a sigma; 0 if it is not finite or not positive."""
     return sigma if isfinite(sigma) and sigma > 0.0 else 0.0
 
 
 def place_of(
     place: tuple[float, float, float], status: int, horizontal_m: float, vertical_m: float
 ) -> SaidPlace | Rejection:
-    """Return a fix whose sigmas may be unknown (0, NaN)."""
+    """Return a fix whose sigmas may be unknown (0, NaN); a rejection if the horizontal one is as large as of no fix."""
     if horizontal_m >= _MOST_M:
         return rejected(f"no fix by its accuracy ({horizontal_m:.0f} m)")
     horizontal, vertical = sigma_of(horizontal_m), sigma_of(vertical_m)
     known = horizontal >= _FEWEST_M
-    # The height may be worse: of a receiver that holds it, a kilometre.
+    # The vertical sigma may be larger: a receiver that holds its height says a kilometre.
     return SaidPlace(*place, status, horizontal if known else 0.0, vertical if vertical >= _FEWEST_M else 0.0)
 
 
@@ -146,14 +162,14 @@ def yaw_of(q: Any) -> float:
 
 
 def heading_by_bearing(angle_deg: float, sigma_deg: float) -> SaidHeading | Rejection:
-    """Return a true heading, clockwise from north, as a yaw."""
+    """Return a true heading, clockwise from north, as a yaw from east, counter-clockwise."""
     if not isfinite(angle_deg):
         return rejected("no heading (NaN)")
     return SaidHeading(radians(90.0 - angle_deg), radians(sigma_of(sigma_deg)))
 
 
 def heading_as_told(angle_deg: float, sigma_deg: float) -> SaidHeading | Rejection:
-    """Return a heading as it stands in a message whose axes the driver's configuration tells."""
+    """Return a heading as a message says it whose axes depend on the driver's configuration."""
     if not isfinite(angle_deg) or abs(angle_deg) > DO_NOT_USE:
         return rejected("no heading")
     return SaidHeading(radians(angle_deg % 360.0), radians(sigma_of(sigma_deg)))

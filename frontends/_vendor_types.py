@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Definitions of makers' messages, for bags that carry none: those of ROS 2 Humble and older in sqlite3.
+"""Definitions of makers' messages, for bags without definitions: of ROS 2 Humble and older, in sqlite3.
 
-Versions of a driver differ; of several definitions the longest comes first, since bytes that are left over tell a wrong one. What lies
-behind the last field that is read may be shorter by up to three bytes than in the message.
+Versions of a driver differ. Of several definitions the longest comes first, since only bytes left over show a wrong
+one. Behind the last field that is read, a definition may be up to three bytes shorter than the message.
 """
 
 from __future__ import annotations
@@ -12,7 +12,12 @@ _HEADER = "std_msgs/Header header"
 
 
 def _definition(fields: str, **parts: str) -> str:
-    """Return a definition as bags hold it; fields separated by semicolons, `parts` by name of type, package and name joined by two underscores."""
+    """Return a definition as bags hold it.
+
+    Args:
+        fields: separated by semicolons. parts: definitions of further types, by package and name joined by two
+            underscores.
+    """
     said = [fields, *(f"{_LINE}\nMSG: {name.replace('__', '/')}\n{part}" for name, part in parts.items())]
     return "\n".join(text.replace("; ", "\n") for text in said) + "\n"
 
@@ -23,7 +28,7 @@ def _flags(names: str) -> str:
 
 _SBG_IMU = _flags(
     "imu_com imu_status imu_accel_x imu_accel_y imu_accel_z imu_gyro_x imu_gyro_y imu_gyro_z imu_accels_in_range imu_gyros_in_range "
-    "imu_gyros_use_high_scale"  # not in all versions; what follows is aligned so that it may lack
+    "imu_gyros_use_high_scale"  # not in all versions; the alignment of what follows allows it to be missing
 )
 _SBG_SIGNALS = "gps_l1_used gps_l2_used gps_l5_used glo_l1_used glo_l2_used"
 _SBG_MORE_SIGNALS = (

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read a bag as a `Recording`: measurements, inertial samples, and a ledger row for each message that gave none.
+"""Read a bag as a `Recording`: measurements, inertial samples, and a ledger row for each message that gave neither.
 
-Steps: subscribe to the topics that the configuration names; decode them message by message; reject implausible stamps; check the
-whole run for wrong units. Messages of other topics are counted from the bag's index and never decompressed, so they need no memory.
+Steps: subscribe to the topics that the configuration names; decode their messages one by one; reject implausible
+stamps; check the whole run for wrong units. Messages of other topics are counted from the bag's index and never
+decompressed, so they need no memory.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, Im
 from graphloc.recording import Mounts, Progress, Recording, Span
 from graphloc.time import NS_PER_S
 
-_FIRST_SCANS = 20  # of a LiDAR, that tell its clock
+_FIRST_SCANS = 20  # so many first scans of a LiDAR tell how late they are recorded
 
 
 def check_bag(bags: Bags, config: VesselConfig) -> None:
@@ -83,18 +84,18 @@ def read_recording(bags: Bags | Bag, config: VesselConfig, progress: Progress | 
     """Read the topics that the configuration names.
 
     Args:
-        bags: a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, several files of a split bag, a part of them, or a bag that is
-            not opened yet.
+        bags: a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, several files of a split bag, a part of them, or a
+            bag that is not opened yet.
         config: topics, units and mounts of the sensors.
-        progress: is called now and then with the stage, messages done and messages in all.
+        progress: called now and then with the stage, the number of messages done and that of all messages.
 
     Returns:
-        The recording. Its measurements, IMU samples and rows add up to its `message_count`, in which a message that several
-        sensors read counts once for each.
+        The recording. Its measurements, IMU samples and rows add up to its `message_count`, in which a message that
+        several sensors read counts once for each sensor.
 
     Raises:
-        InputError: no readable bag, a missing topic or one of another type, a mount without a chain of transforms, or an empty
-            part of the bag.
+        InputError: no readable bag, a missing topic or one of another type, a mount without a chain of transforms, or
+            an empty part of the bag.
     """
     with unopened(bags) as bag:
         topics = bag.topics
@@ -145,7 +146,11 @@ def read_recording(bags: Bags | Bag, config: VesselConfig, progress: Progress | 
 
 
 def _scan_latencies(bag: Bag, config: VesselConfig) -> dict[str, float]:
-    """Return by aerial sensor how much later than stamped its scans are usually recorded, s, by the first of each LiDAR; of the earliest LiDAR."""
+    """Return by aerial sensor how much later than stamped its scans are usually recorded, s.
+
+    It is the median over the first scans of a LiDAR; of several LiDARs, the least. Sensors without header stamps, and
+    LiDARs without stamped scans, are left out.
+    """
     found = {}
     for name, sensor in config.of_kind("aerial").items():
         latency_s = []
@@ -154,7 +159,7 @@ def _scan_latencies(bag: Bag, config: VesselConfig) -> dict[str, float]:
             for raw in islice(bag.messages({lidar.topic}), _FIRST_SCANS) if lidar.topic in bag.topics else ():
                 try:
                     stamp_ns = stamp_ns_of(bag.decode(raw), raw.msgtype, raw.log_ns)
-                except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; others will do
+                except Exception:  # noqa: BLE001, S112 - damaged bytes make rosbags raise nearly anything; others do
                     continue
                 if stamp_ns is not None:
                     own.append((raw.log_ns - corrected_ns(stamp_ns, sensor, raw.elapsed_ns)) / NS_PER_S)
@@ -168,7 +173,13 @@ def _scan_latencies(bag: Bag, config: VesselConfig) -> dict[str, float]:
 def _scan_clocks(
     sensors: Sequence[Readings], latencies_s: Mapping[str, float], config: VesselConfig, warnings: list[str]
 ) -> tuple[str, ...]:
-    """Warn of LiDARs whose clock is not the IMU's, by the recording times; return those lines that make all poses doubtful."""
+    """Add a warning on each aerial sensor whose clock is not the IMU's; return those that make all poses doubtful.
+
+    Clocks are compared by the recording times.
+
+    Args:
+        latencies_s: by aerial sensor, of `_scan_latencies`. warnings: gets the new lines.
+    """
     imu = next((r for r in sensors if r.config.kind == "imu" and r.stamps_ns), None)
     doubts = []
     for name, latency_s in latencies_s.items() if imu is not None else ():
@@ -185,7 +196,7 @@ def _scan_clocks(
 def _usable(
     sensors: Sequence[Readings], config: VesselConfig, warnings: list[str]
 ) -> tuple[ImuSeries | None, list[Measurement], list[LedgerRow]]:
-    """Return the IMU samples and measurements that pass the checks of a whole run, and rows of those that do not."""
+    """Return IMU samples and measurements that pass the checks of a whole run, and ledger rows of all others."""
     imu: ImuSeries | None = None
     measurements: list[Measurement] = []
     rows: list[LedgerRow] = []
@@ -202,7 +213,11 @@ def _usable(
 
 
 def _span(bag: Bag, config: VesselConfig) -> Span | None:
-    """Return the part of the bag, with counts of the topics that the configuration names."""
+    """Return the part of the bag that is read, with counts of the topics that the configuration names; None: all of it.
+
+    Raises:
+        InputError: the part holds no message of these topics.
+    """
     if bag.span is None:
         return None
     sensors = [sensor for sensor in config.sensors.values() if sensor.enabled]
@@ -219,7 +234,11 @@ def _span(bag: Bag, config: VesselConfig) -> Span | None:
 
 
 def _asked_for(config: VesselConfig, bag: Bag) -> tuple[list[Readings], Reference | None, Reference | None]:
-    """Return what is read of a bag: for each sensor, for the truth, and for the speed to compare with."""
+    """Return empty containers for what is read of a bag: of sensors, of the truth, and of the speed to compare with.
+
+    Raises:
+        InputError: see `check_bag`.
+    """
     sensors = _subscriptions(config, bag.topics, bag.name)
     truth = _reference(config.truth_topic, "truth_topic", "truth, never fused", bag.topics, bag.name)
     check = _reference(config.check_speed_topic, "check_speed_topic", "check, never fused", bag.topics, bag.name)
@@ -239,13 +258,26 @@ def _subscriptions(config: VesselConfig, topics: Mapping[str, TopicSummary], bag
 
 
 def _tells_both(own: Sequence[str], other: Sequence[str]) -> bool:
-    """Whether no sentence that both lists name tells one velocity alone; VBW tells that over ground and that through the water."""
+    """Return whether VBW is the only sentence that two lists of NMEA sentences share, if they share any.
+
+    VBW tells the velocity over ground and the one through the water, so two sensors may read it.
+    """
     kinds = {said[-3:] for said in own} & {said[-3:] for said in other}
     return kinds <= {"VBW"}
 
 
 def _check_through(name: str, sensor: SensorConfig, others: Sequence[Readings], topic: TopicSummary, bag: str) -> None:
-    """Raise an `InputError` if another sensor reads the same velocities as those through something else, and nothing tells which they are."""
+    """Refuse a log that another sensor reads, too, one as over ground and one as through water.
+
+    Accepted are messages that say which velocity they are, and NMEA sentences that differ or tell both velocities
+    (VBW).
+
+    Args:
+        others: the sensors that were subscribed before. topic: the topic of `sensor`.
+
+    Raises:
+        InputError: nothing tells which of the two velocities the messages hold.
+    """
     if not isinstance(sensor, BodyVelocityConfig):
         return
     own = [r for r in others if r.config.topic == sensor.topic]
@@ -287,7 +319,11 @@ def _reference(
 
 
 def _mounts(config: VesselConfig, tree: StaticTree | None, bag: str) -> dict[str, tuple[Array, Array]]:
-    """Return the mounts of all enabled sensors that name a frame of /tf_static, including those that read no topic."""
+    """Return the mounts of all enabled sensors that name a frame of /tf_static, also of sensors that read no topic.
+
+    Raises:
+        InputError: no chain of transforms leads from the body to a frame.
+    """
     if tree is None:
         return {}
     return {
@@ -307,7 +343,14 @@ def _far_levers(config: VesselConfig, mounts: Mounts) -> list[str]:
 
 
 def _unit_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
-    """Refuse rates whose turns are another unit's; return a line on those that are too fast, where no turns say that they are right."""
+    """Refuse angular rates in another unit than configured, by headings, poses and courses.
+
+    Returns:
+        Where none of these confirms the unit, a warning on rates that are too fast for it.
+
+    Raises:
+        InputError: see `refuse_unit`.
+    """
     (config,) = (r.config for r in sensors if r.sensor == imu.sensor and isinstance(r.config, ImuConfig))
     yaws: dict[str, Yaws] = {}
     for readings in sensors:
@@ -357,7 +400,10 @@ def _motions_of_fixes(sensors: Sequence[Readings]) -> dict[str, MeasuredMotion]:
 def _mount_warnings(
     imu: ImuSeries, motions: Sequence[MeasuredMotion], mounts: Mounts, config: VesselConfig
 ) -> list[str]:
-    """Return a line if the IMU's mount has a wrong yaw, by the motion of the fixes; no heading sensor would contradict it."""
+    """Return a warning if the motion of the fixes says that the IMU's mount has a wrong yaw.
+
+    No heading sensor would contradict a wrong mount.
+    """
     mount = config.sensors[imu.sensor].mount
     R = mounts[imu.sensor][1] if imu.sensor in mounts else mount.R_body_sensor
     found = (
@@ -372,7 +418,7 @@ def _mount_warnings(
 
 
 def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) -> list[str]:
-    """Say which sensors' messages have the recording times for stamps, as they are."""
+    """Return a warning for each sensor whose recording times are used as stamps without a correction or a sigma."""
     lines = []
     for r in sensors:
         types = topics[r.config.topic].msgtypes
@@ -390,7 +436,10 @@ def _unstamped(sensors: Sequence[Readings], topics: Mapping[str, TopicSummary]) 
 
 
 def _heightless(sensors: Sequence[Readings], config: VesselConfig) -> list[str]:
-    """Say that poses without z alone leave the height to the accelerometer; of fixes, `_fixes.height_warning` says it."""
+    """Return a warning if only poses without z tell the position: the height is then left to the accelerometer.
+
+    Of fixes without a height, `_fixes.height_warning` warns.
+    """
     poses = {**config.of_kind("pose"), **config.of_kind("aerial")}
     kinds = {sensor.kind for sensor in config.sensors.values() if sensor.enabled}
     telling = kinds - {"imu", "compass", "gnss", "gnss_velocity", "body_velocity", "pose", "aerial"}
@@ -407,7 +456,10 @@ def _heightless(sensors: Sequence[Readings], config: VesselConfig) -> list[str]:
 
 
 def _along_fewer(sensors: Sequence[Readings]) -> list[str]:
-    """Say which of its axes a speed does not tell: a number and VHW are one ahead, and say nothing of drift."""
+    """Return a warning for each speed sensor whose messages lack a configured axis.
+
+    A bare number and VHW tell the speed ahead, and nothing of the drift sideways.
+    """
     lines = []
     for readings in sensors:
         if isinstance(readings.config, BodyVelocityConfig) and readings.values:
@@ -423,12 +475,15 @@ def _along_fewer(sensors: Sequence[Readings]) -> list[str]:
 def _silent(
     sensors: Sequence[Readings], rows: Sequence[LedgerRow], topics: Mapping[str, TopicSummary], config: VesselConfig
 ) -> list[str]:
-    """Return a line for each sensor without a reading, with the main reason; of those that read a receiver by turns one may lack any."""
+    """Return a warning for each sensor without a reading, with the main reason.
+
+    Of sensors that take turns at one receiver, it is enough that one has readings.
+    """
     lines = []
     heard = {config.receiver_of(r.sensor) for r in sensors if r.values}
     for readings in (r for r in sensors if config.receiver_of(r.sensor) not in heard):
         own = [r for r in rows if r.sensor == readings.sensor]
-        # Of a line of NMEA most is for others, which is no reason.
+        # Most sentences on an NMEA line are for other sensors, which is no reason.
         reasons = Counter(r.reason for r in own if r.outcome is not Outcome.IGNORED) or Counter(r.reason for r in own)
         why = f", mostly: {reasons.most_common(1)[0][0]}" if reasons else ""
         count = topics[readings.config.topic].messages

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoders by (sensor kind, message type): pure functions from message to measurement.
 
-A decoder gives what the message states, in the project's frames and units. It sets an uncertainty only if the message has none;
-floors, scales and kernels belong to the factors.
+A decoder returns what the message states, in the project's frames and units. It sets an uncertainty only if the message
+has none; floors, scales and kernels belong to the factors.
 """
 
 from __future__ import annotations
@@ -73,34 +73,35 @@ NO_STAMP = "`stamps: recorded` of that sensor takes the recording time instead"
 _MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
 _STATUS_UNKNOWN = -2
 _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
-NMEA_STATUS = {2: 1, 9: 1, 4: 2, 5: 2}  # of NavSatStatus, by quality of GGA: differential, RTK
-_RTK_SIGMAS_M = {4: (0.02, 0.04), 5: (0.3, 0.6)}  # horizontal, vertical, at a dilution of 1: fixed, float
-MOST_TURNS = 20  # of a heading that is counted on from turn to turn
+NMEA_STATUS = {2: 1, 9: 1, 4: 2, 5: 2}  # quality of GGA (differential, RTK) to NavSatStatus
+_RTK_SIGMAS_M = {4: (0.02, 0.04), 5: (0.3, 0.6)}  # by quality (fixed, float): horizontal, vertical; at a dilution of 1
+MOST_TURNS = 20  # a heading that is not wrapped counts no more turns
 _UNIT_MPS = {"m/s": 1.0, "km/h": nmea.KM_PER_H_MPS, "knots": nmea.KNOT_MPS}
 _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _NO_CLIMB_MPS2 = 1e6  # variance of a vertical velocity that is not told, m^2/s^2
-# Beyond these no sensor of a vessel measures; they are finite, and a sum or a square of them need not be.
-_MOST_INERTIAL = 1e4  # in the unit of the bag: 1000 g; 30 turns a second in deg/s
+# No sensor of a vessel measures beyond these limits. Sums and squares of larger finite values may overflow.
+_MOST_INERTIAL = 1e4  # in the unit of the bag: 1000 g in m/s^2, 30 turns a second in deg/s
 MOST_SPEED_MPS, MOST_DISTANCE_M, _MOST_HEIGHT_M = 1e4, 1e7, 1e5
 NO_LOCK_MPS = 32.768
-"""The least integer of 16 bits, in mm/s, less its sign."""
-_VARIANCES = (1e-18, 1e12)  # m^2 and the like: 1 nm to 1000 km
+"""Size of the least 16-bit integer, in mm/s, which Doppler logs write without a lock."""
+_VARIANCES = (1e-18, 1e12)  # least and largest variance, m^2 and the like: of 1 nm and of 1000 km
 
 
 class ImuReading(NamedTuple):
-    """One inertial sample as decoded: axes of the sensor, SI units; `Readings` has its stamp and number."""
+    """One inertial sample in axes of the sensor and SI units; `Readings` holds its stamp and arrival number."""
 
     accel_mps2: tuple[float, float, float]
     gyro_radps: tuple[float, float, float]
 
 
 Decoded = Measurement | ImuReading | Rejection
-# The message and the configuration are whatever this row of the table asks for, hence Any.
+# Message, stamp (ns), arrival number, sensor, configuration. Types of message and configuration depend on the row of
+# `DECODERS`, hence Any.
 Decoder = Callable[[Any, int, int, str, Any], Decoded]
 
 
 def header_stamp_ns(msg: Any) -> int | None:
-    """Return the header's stamp in ns; None where the message has no stamp, a zero or a negative one."""
+    """Return the stamp of a message's header, ns; None if it has none, or a zero or negative one."""
     stamp = getattr(getattr(msg, "header", None), "stamp", None)
     if stamp is None:
         return None
@@ -109,39 +110,41 @@ def header_stamp_ns(msg: Any) -> int | None:
 
 
 def stamp_ns_of(msg: Any, msgtype: str, log_ns: int, *, recorded: bool = False) -> int | None:
-    """Return the stamp of a message, ns: that of its header, or its recording time if that is configured or its type has no stamp.
+    """Return the stamp of a message, ns: that of its header, or the time that a maker's message without a header says.
 
-    None if the header's stamp is zero or negative. Of makers' messages without a header it is the time that they say.
+    It is the recording time if the type has no stamp, or if `recorded`. None if the stamp is zero, negative or
+    unusable.
     """
     if recorded or msgtype in UNSTAMPED:
         return log_ns
     try:
         return STAMPS[msgtype](msg, log_ns) if msgtype in STAMPS else header_stamp_ns(msg)
     except (AttributeError, TypeError, ValueError, OverflowError):
-        # another version of a maker's message, or fields of other types
+        # Another version of a maker's message, or fields of other types.
         return None
 
 
 def covariance_translation_first(values: ArrayLike) -> Array:
-    """Return a ROS 6x6 covariance (36 values, row-major) in its order: x, y, z, then small rotations about fixed x, y, z axes.
+    """Return a ROS covariance (36 values, row-major) as (6, 6), in its order.
 
-    Every ROS 6x6 enters by this function; the factors make GTSAM's order (rotation first, in body) of it.
+    The order is x, y, z, then small rotations about fixed axes x, y, z. Every ROS 6x6 enters by this function; the
+    factors convert it to GTSAM's order, rotation first, in body.
     """
     return np.asarray(values, dtype=float).reshape(6, 6)
 
 
 def usable_covariance(cov: Array, default_variances: Array) -> Array:
-    """Return `cov` (k, k) with the default on axes whose variance is zero, negative or NaN.
+    """Return `cov` (k, k) with default variances (k,) on axes whose variance is zero, negative or NaN.
 
-    Such an axis loses its correlations. So does one with a variance outside (1 nm)^2 to (1000 km)^2, which is clipped. If the matrix
-    is still not positive definite, only its diagonal is kept.
+    Such an axis loses its correlations. So does an axis whose variance is outside (1 nm)^2 to (1000 km)^2: it is
+    clipped. If the matrix is still not positive definite, only its diagonal is kept.
     """
     variance = np.diagonal(cov)
     if all(_VARIANCES[0] <= v <= _VARIANCES[1] for v in variance.tolist()) and np.count_nonzero(cov) == len(cov):
-        return np.diag(variance)  # nothing to mend, as mostly: a twentieth of the time
+        return np.diag(variance)  # the usual case, nothing to mend: takes a twentieth of the time
     good = np.isfinite(variance) & (variance > 0.0)
     known = good & (variance >= _VARIANCES[0]) & (variance <= _VARIANCES[1])
-    # No correlation is larger than 1; one that says so may be of any size.
+    # Covariances that make correlations larger than 1 are invalid, and may have any size.
     both = np.outer(known, known) & (np.abs(cov) <= _VARIANCES[1])
     clean = np.where(both, cov, 0.0)
     clean = 0.5 * (clean + clean.T)
@@ -152,7 +155,7 @@ def usable_covariance(cov: Array, default_variances: Array) -> Array:
 
 
 def yaw_of_x_axis(x: float, y: float, z: float, w: float) -> float | Rejection:
-    """Return the direction (rad, about the up or down axis of the frame) of the x axis of a quaternion.
+    """Return the direction of a quaternion's x axis, rad, about the vertical axis (up or down) of its frame.
 
     Drivers that only know a heading write NaN for x and y; then z and w alone give the yaw.
     """
@@ -175,9 +178,9 @@ def yaw_of_x_axis(x: float, y: float, z: float, w: float) -> float | Rejection:
 
 
 def nav_sat_status(status: int) -> int:
-    """Return the status of a NavSatFix or GPSFix as in NavSatFix: differential (18) and WAAS (33) become `sbas`.
+    """Return the status of a NavSatFix or GPSFix as in NavSatStatus: differential (18) and WAAS (33) become `sbas`.
 
-    -2 (`STATUS_UNKNOWN` of ROS 2 Jazzy, and there the default) is left by drivers that do not fill it in: a place is a fix.
+    -2 (`STATUS_UNKNOWN`, the default in ROS 2 Jazzy) is what drivers leave that do not fill it in: taken for a fix.
     """
     return {18: 1, 33: 1, _STATUS_UNKNOWN: 0}.get(status, status)
 
@@ -197,7 +200,7 @@ def _imu(msg: Any, _stamp_ns: int, _seq: int, _sensor: str, config: ImuConfig) -
 def _inertial(
     accel: tuple[float, float, float], gyro: tuple[float, float, float], config: ImuConfig
 ) -> ImuReading | Rejection:
-    """Return a sample, in the units that are configured, in SI units."""
+    """Return a sample in SI units, converted from the configured units and sign of gravity."""
     if not all(map(isfinite, (*accel, *gyro))):
         return malformed("acceleration or angular rate is NaN")
     if max(map(abs, (*accel, *gyro))) > _MOST_INERTIAL:
@@ -225,7 +228,7 @@ def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) ->
 
 
 def nmea_sigmas_m(fix: nmea.Fix, default_m: tuple[float, float]) -> tuple[float, float]:
-    """Return sigmas, horizontal and vertical, m, by quality (RTK; of others the default at a dilution of 1) and dilution."""
+    """Return horizontal and vertical sigma of a fix, m: by quality for RTK, else the default; times the dilution."""
     horizontal, vertical = _RTK_SIGMAS_M.get(fix.quality, default_m)
     dilution = min(max(fix.hdop, 1.0), 100.0) if isfinite(fix.hdop) else 1.0
     return dilution * horizontal, dilution * vertical
@@ -252,7 +255,10 @@ def _from_grid(grid: str) -> Transformer:
 
 
 def _gnss_grid(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) -> Decoded:
-    """Position of a pose in a map grid; its orientation is not used. The grid's north is off by a few degrees, which a covariance ignores."""
+    """Decode the position of a pose in a map grid; its orientation is not used.
+
+    The grid's north is off by a few degrees, by which the covariance is not turned.
+    """
     if not config.grid:
         return malformed("a position in a map grid: set grid to its name, e.g. EPSG:32632 for UTM zone 32 north")
     (x, y, height), _ = pose_of(msg)
@@ -276,7 +282,12 @@ def _placed(
     config: GnssConfig,
     status: int = _MIN_STATUS["gbas"],
 ) -> Decoded:
-    """Return a fix at latitude and longitude, deg, and height, m (NaN: unknown); `status`: where its message has one."""
+    """Return a fix, or its rejection.
+
+    Args:
+        place: latitude and longitude, deg, and height, m, NaN if unknown. cov: (3, 3), m^2, east, north, up; zeros if
+            unknown. stamp_ns, seq, sensor, config: as of a decoder. status: as of NavSatStatus.
+    """
     lat, lon, height = place
     if not np.isfinite([lat, lon]).all():
         return malformed("latitude or longitude is NaN")
@@ -295,7 +306,7 @@ def _placed(
     default = np.array([config.default_horizontal_sigma_m] * 2 + [config.default_vertical_sigma_m]) ** 2
     if planar:
         cov = cov.copy()
-        cov[2, :] = cov[:, 2] = 0.0  # what the message claims of a height that it does not give
+        cov[2, :] = cov[:, 2] = 0.0  # the message gives no height, so its claim on one does not count
         default[2] = NO_HEIGHT_M2
     if config.takes_turns:
         rtk = is_rtk(status, cov)
@@ -313,7 +324,7 @@ def _placed(
 
 
 def is_rtk(status: int, cov: Array) -> bool:
-    """Return whether a fix is of RTK: by its `NavSatStatus`, and its covariance (3, 3), m^2 (zeros or NaN: unknown)."""
+    """Return whether a fix is of RTK, by its `NavSatStatus` and its covariance (3, 3), m^2, zeros or NaN if unknown."""
     variance = np.diagonal(cov)[:2]
     known = bool(np.isfinite(variance).all() and (variance > 0.0).all())
     return status >= _MIN_STATUS["gbas"] and known and float(variance.max()) < RTK_SIGMA_M**2
@@ -323,7 +334,7 @@ def _heading(orientation: Any, variance: float, stamp_ns: int, seq: int, sensor:
     yaw = yaw_of_x_axis(*(float(v) for v in (orientation.x, orientation.y, orientation.z, orientation.w)))
     if isinstance(yaw, Rejection):
         return yaw
-    if config.convention == "ned":  # there yaw is the heading: clockwise from north
+    if config.convention == "ned":  # yaw is then the heading: clockwise from north
         yaw = float(wrap_angle(np.pi / 2.0 - yaw))
     reported = config.use_reported_sigma and np.isfinite(variance) and variance > 0.0
     sigma = float(np.sqrt(np.clip(variance, *_VARIANCES))) if reported else float(np.radians(config.sigma_deg))
@@ -365,7 +376,7 @@ def _compass_number(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Comp
 
 
 def _twist(msg: Any) -> tuple[tuple[float, float, float], Array]:
-    """Return the linear velocity of a message and its covariance (3, 3), zero if it has none."""
+    """Return the linear velocity of a message and its covariance (3, 3), zeros if it has none."""
     with_covariance = hasattr(msg.twist, "covariance")
     v = msg.twist.twist.linear if with_covariance else msg.twist.linear
     cov = covariance_translation_first(msg.twist.covariance)[:3, :3] if with_covariance else np.zeros((3, 3))
@@ -398,10 +409,10 @@ def _velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Veloc
 
 
 def gps_fix_velocity_mps(msg: Any) -> tuple[float, float, float] | Rejection:
-    """Return the velocity of a GPSFix over ground, east, north, up, m/s: its speed, its track clockwise from true north, its climb.
+    """Return the velocity over ground of a GPSFix, east, north, up, m/s, by its speed, track and climb.
 
-    NaN where it tells no climb: a receiver measures none to be exactly 0, but drivers of NMEA leave it at that. Its errors are left out:
-    drivers disagree on what they mean.
+    The track is clockwise from true north. Up is NaN if the climb is exactly 0: no receiver measures that, but drivers
+    of NMEA leave it so. The errors in the message are not used: drivers disagree on their meaning.
     """
     if nav_sat_status(int(msg.status.status)) < 0:
         return rejected("no fix (STATUS_NO_FIX)")
@@ -446,10 +457,10 @@ def _no_velocity(value: Array) -> Rejection | None:
 
 
 def no_lock(value: ArrayLike) -> bool:
-    """Return whether a velocity holds what Doppler logs write where they hear no echo."""
+    """Return whether a velocity holds the value that Doppler logs write if they hear no echo."""
     return bool(
         (np.abs(np.abs(value) - NO_LOCK_MPS) < 1e-5).any()
-    )  # of float32, and of either sign once axes are turned
+    )  # with a tolerance for float32, and of either sign, as axes may have been turned
 
 
 def _body_velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:
@@ -490,14 +501,14 @@ def _along(
 
 
 def is_unit(quaternion: Array) -> bool:
-    """Return whether a quaternion (4,) has unit norm, to the digits that drivers write."""
+    """Return whether a quaternion (4,) has about unit norm: drivers write few digits."""
     return bool((np.abs(quaternion) < 2.0).all()) and abs(float(np.linalg.norm(quaternion)) - 1.0) < 0.1
 
 
 def pose_of(msg: Any) -> tuple[Array, Array | None]:
-    """Return position (3,) and rotation (3, 3) of an Odometry, PoseWithCovarianceStamped, PoseStamped, TransformStamped or PointStamped message.
+    """Return the position (3,) and rotation (3, 3) of a message of `POSE_TYPES`.
 
-    The rotation is None if the quaternion is invalid, or the message has none.
+    The rotation is None if the message has no quaternion, or an invalid one.
     """
     *place, x, y, z, w = pose_numbers(msg)
     quaternion = np.array([x, y, z, w])
@@ -505,7 +516,7 @@ def pose_of(msg: Any) -> tuple[Array, Array | None]:
 
 
 def pose_numbers(msg: Any) -> tuple[float, ...]:
-    """Return x, y, z, and x, y, z, w of the quaternion, of a message as `pose_of` takes; NaN where it has no orientation."""
+    """Return x, y, z, and the quaternion's x, y, z, w, of a message of `POSE_TYPES`; NaN if it has no orientation."""
     if hasattr(msg, "transform"):
         p, q = msg.transform.translation, msg.transform.rotation
     elif hasattr(msg, "point"):
@@ -539,7 +550,7 @@ def _pose(msg: Any, stamp_ns: int, seq: int, sensor: str, config: PoseConfig) ->
 
 
 def _by_maker(part: Part) -> Decoder:
-    """Return the decoder of one of the things that a maker's message says."""
+    """Return the decoder of one part of a maker's message."""
 
     def decoder(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Any) -> Decoded:
         said = part.read(msg)
@@ -597,11 +608,11 @@ DECODERS: dict[tuple[str, str], Decoder] = {
 }
 
 
-GROUP = "graphloc.decoders"  # of entry points: name a kind, load a mapping of message type to decoder
+GROUP = "graphloc.decoders"  # group of entry points: each is named as a kind, and loads {message type: decoder}
 
 
 def decoder_of(kind: str, msgtype: str) -> Decoder | None:
-    """Return the decoder of a message type for a kind of sensor, ours or an installed package's; None if there is none."""
+    """Return the decoder of a message type for a kind of sensor, ours or an entry point's; None if there is none."""
     return DECODERS.get((kind, msgtype)) or added(GROUP).get(kind, {}).get(msgtype)
 
 

@@ -88,21 +88,23 @@ __all__ = [
     "render",
 ]
 
-_AS_NOISY = 1.5  # gyro noise, times that of the least noisy IMU, up to which one is as good
-_DOWN = np.diag([1.0, -1.0, -1.0])  # to axes ahead, to port, up from such ahead, to starboard, down
-_BELOW_M, _ALIKE = 0.05, 0.9  # antennas in tf, from which its z points down; cosine between axes taken for the same
-_FEWEST = 20  # places of a track
-_STAYS = 0.05  # as a share of the way of a receiver, within which another one stays where it is
+_AS_NOISY = 1.5  # an IMU is as good as the least noisy one up to so many times its gyro noise
+_DOWN = np.diag([1.0, -1.0, -1.0])  # from axes ahead, to starboard, down to axes ahead, to port, up
+# Antennas so far below the body in tf say that its z points down; axes with a larger cosine between them are the same.
+_BELOW_M, _ALIKE = 0.05, 0.9
+_FEWEST = 20  # more places than this make a track
+_STAYS = 0.05  # a receiver that roams over less than this share of another one's extent stays where it is
 
 
 def inspect_bag(bags: Bags | Bag) -> Inspection:
     """Inspect a bag.
 
-    Receivers come first, since the other sensors are judged by the track of the best one; then what else tells the motion, IMUs by that,
-    headings by the gyroscope of the best IMU, and by what this one feels how late stamps are.
+    Receivers come first, since the other sensors are judged by the track of the best one. Then come the other topics
+    that tell the motion; IMUs, by the motion; headings, by the gyroscope of the best IMU; and how late stamps are, by
+    what the best IMU feels.
 
     Args:
-        bags: as for `read_recording`.
+        bags: see `read_recording`.
 
     Raises:
         InputError: the bag cannot be opened, or its parts overlap in time.
@@ -150,7 +152,11 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
 
 
 def _elsewhere(bag: Contents, gnss: Sequence[GnssReport]) -> dict[str, str]:
-    """Return why receivers are not of this craft, by topic: the best IMU feels nothing of how they move, but of how another one does, far from them."""
+    """Return by topic why receivers are not of this craft.
+
+    Such a receiver is far from another one, or stays where it is; the best IMU does not feel the motion of its fixes,
+    but feels that of another receiver.
+    """
     farthest_m = max((report.roams_m for report in gnss if not filtered(report.topic)), default=0.0)
 
     def stays(report: GnssReport) -> bool:
@@ -168,7 +174,7 @@ def _elsewhere(bag: Contents, gnss: Sequence[GnssReport]) -> dict[str, str]:
         return bool(imus) and feels_motion(bag.aligned[imus[0].topic], imus[0], evidence)
 
     unfelt = {report.topic for report in gnss if not felt(report)}
-    # A filter's output moves as the IMU does, of which it is made.
+    # A filter's output is made from the IMU, so it moves as the IMU feels, and proves nothing.
     aboard = next((report for report in gnss if report.topic not in unfelt and not filtered(report.topic)), None)
     if aboard is None or aboard is gnss[0]:
         return {}
@@ -204,7 +210,10 @@ def _topic_reports(bag: Contents) -> tuple[TopicReport, ...]:
 
 
 def _best_track(bag: Contents, gnss: Sequence[GnssReport]) -> ReferenceTrack:
-    """Return the track of the first receiver, without frozen fixes; without one, that of poses in a map grid; else an empty one."""
+    """Return the track of the first receiver, without frozen fixes.
+
+    Without a receiver it is the track of poses in a map grid; without these, an empty one.
+    """
     if not gnss:
         return _grid_track(bag)
     best = gnss[0]
@@ -214,7 +223,10 @@ def _best_track(bag: Contents, gnss: Sequence[GnssReport]) -> ReferenceTrack:
 
 
 def _grid_track(bag: Contents) -> ReferenceTrack:
-    """Return the first track in a map grid, about its first position; the grid's north is off by a few degrees."""
+    """Return the track of the first poses in a map grid, about their first position.
+
+    The grid's north is off true north by up to a few degrees.
+    """
     for stream in bag.of_type(*POSE_TYPES):
         keep = sane(stream)
         p_m = stream.rows[keep, :3]
@@ -228,7 +240,7 @@ def _grid_track(bag: Contents) -> ReferenceTrack:
 def _odometry_reports(
     bag: Contents, gnss: Sequence[GnssReport], reference: ReferenceTrack
 ) -> list[tuple[TopicData, OdometryReport]]:
-    """Report odometry and poses, by the track and the place of the antenna that it is of."""
+    """Report odometry and poses, judged by the reference track and the place of its antenna in tf."""
     frame = gnss[0].tf_frame if gnss else None
     mount = bag.tree.resolve(bag.tree.body(), frame) if frame else None
     antenna_m = None if mount is None else mount[0]
@@ -249,7 +261,10 @@ def _motions(
     odometry: Sequence[tuple[TopicData, OdometryReport]],
     velocities: Sequence[tuple[TopicData, VelocityReport]],
 ) -> list[MeasuredMotion]:
-    """Return how the craft moved, by each topic that tells it, the most accurate first; by poses only where there is no receiver."""
+    """Return how the craft moved, by each topic that tells it, the most accurate first.
+
+    Poses are asked only where there is no receiver.
+    """
     wheels = [s for s, report in odometry if report.role == "check_speed"]
     motions = motions_of(wheels, velocities, bag.of_type(*FIX_TYPES))
     if reference.first is not None:
@@ -262,9 +277,9 @@ def _motions(
 def _imu_reports(bag: Contents, evidence: ImuEvidence) -> list[ImuReport]:
     """Return the reports on the IMUs, the best one first.
 
-    In this order: those with rates and accelerations; with gravity in them; that feel how the craft moves (one that does not turns on
-    its own, as in a stabilised camera); that are about as quiet as the quietest of these; whose mount is known by tf; whose yaw is
-    known; the quietest.
+    An IMU is better, in this order of importance, if it has rates and accelerations; has gravity in these; feels how
+    the craft moves (one that does not turns on its own, as in a stabilised camera); is about as quiet as the quietest
+    of its kind so far; has a mount in tf; has a mount whose yaw is known; has less gyro noise.
     """
     imus = [report for s in bag.of_type(IMU) if (report := imu_report(s, evidence))]
     moved = {imu.topic for imu in imus if len(imus) > 1 and feels_motion(bag.aligned[imu.topic], imu, evidence)}
@@ -288,7 +303,10 @@ def _best_imu(bag: Contents, imus: Sequence[ImuReport], evidence: ImuEvidence) -
 def _beside_headings(
     bag: Contents, imus: Sequence[ImuReport], evidence: ImuEvidence, compasses: Sequence[CompassReport]
 ) -> list[ImuReport]:
-    """Return the reports with the yaw of mounts that the first compass tells which is no IMU's own and knows north."""
+    """Return the reports with mounts turned by the motion that a compass tells, see `turned_as_headed`.
+
+    The compass is the first usable one that is no IMU's own orientation and whose offset from the course is known.
+    """
     known = (
         c for c in compasses if c.usable and c.offset_deg is not None and c.topic not in {imu.topic for imu in imus}
     )
@@ -303,9 +321,13 @@ def _beside_headings(
 def _in_axes_up(
     bag: Contents, gnss: Sequence[GnssReport], imus: list[ImuReport]
 ) -> tuple[list[ImuReport], dict[str, tuple[Vec, Vec]]]:
-    """Return the reports of IMUs, and frames in body, ahead, to port, up, where the body of tf looks down; else the reports, and no frames.
+    """Return the reports of IMUs, and the poses of the frames of tf, in a body with axes ahead, to port, up.
 
-    `_draft` turns what is drafted from tf.
+    Where the body of tf has such axes already, the reports are returned as they are, and no frames. `_draft` takes the
+    mounts of sensors from these frames instead of tf.
+
+    Returns:
+        The reports, and by frame its place (m) and rpy (deg) in the body.
     """
     if not _looks_down(bag, imus, gnss):
         return imus, {}
@@ -315,15 +337,16 @@ def _in_axes_up(
 
 
 def _looks_down(bag: Contents, imus: Sequence[ImuReport], gnss: Sequence[GnssReport]) -> bool:
-    """Return whether the body of tf has its axes ahead, to starboard, down, as makers of INSs have: x and z of the IMU and the antennas say so.
+    """Return whether the axes of the body of tf are ahead, to starboard, down, as makers of INSs have them.
 
-    A driver with such axes of its own, under the frame of a URDF, has its antennas above.
+    The measured mount of the IMU and the places of the antennas must both say so. Where only a driver has such axes,
+    under a frame of a URDF, the antennas are above.
     """
     if not imus or imus[0].mount.tf_frame is not None or imus[0].mount.xyz_m is None:
         return False
     own = bag.aligned[imus[0].topic]
     pose = bag.tf_pose(own)
-    # What an INS says of its own place is no antenna.
+    # A position in the IMU's own frame is the output of an INS, not of an antenna.
     antennas = {g.tf_frame for g in gnss if g.tf_frame not in (None, own.frame_id) and not filtered(g.topic)}
     places = [mount[0] for frame in antennas if frame and (mount := bag.tree.resolve(bag.tree.body(), frame))]
     if pose is None or pose[0][2] > 0.0 or not places or any(place[2] > -_BELOW_M for place in places):
@@ -333,7 +356,7 @@ def _looks_down(bag: Contents, imus: Sequence[ImuReport], gnss: Sequence[GnssRep
 
 
 def _turned(pose: Pose) -> tuple[Vec, Vec]:
-    """Return a place (m) and rpy (deg) ahead, to port, up of a pose in axes ahead, to starboard, down."""
+    """Return the place (m) and rpy (deg), in axes ahead, to port, up, of a pose in axes ahead, to starboard, down."""
     return vec(_DOWN @ pose[0]), vec(np.degrees(rpy_from_rotation(_DOWN @ pose[1])))
 
 
@@ -349,7 +372,10 @@ def _with_wander(
     velocities: Sequence[tuple[TopicData, VelocityReport]],
     motions: Sequence[MeasuredMotion],
 ) -> tuple[GnssReport, ...]:
-    """Return the receivers with how fast their error changes, by wheels or velocities over ground that are no filter's output."""
+    """Return the receivers' reports with how fast their error changes, by wheels or velocities over ground.
+
+    Outputs of filters are not asked: they are made from the fixes.
+    """
     wheels = [s for s, report in odometry if report.role == "check_speed" and not report.fused]
     doppler = {v.topic for _, v in velocities if v.axes in (EAST_AXES, NORTH_AXES) and not filtered(v.topic)}
     told = [motion for motion in motions if motion.source in doppler]
@@ -363,7 +389,7 @@ def _warnings(
     compasses: Sequence[CompassReport],
     odometry: Sequence[OdometryReport],
 ) -> Iterator[str]:
-    """Say what is wrong with the receivers, what is not used, and what is missing."""
+    """Yield what is wrong with the receivers, what is not used, and what is missing."""
     topics = bag.topics.values()
     usable = {c.topic for c in compasses if c.usable}
     for report in gnss:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lines of JSON to measurements (docs/online-stream.md).
 
-A line becomes the message that a bag would hold and passes the decoders of bags, so that a stream and a bag of one run give the
-same measurements.
+A line becomes the message that a bag would hold and passes the decoders of bags, so that a stream and a bag of one run
+give equal measurements.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from graphloc.time import NS_PER_S, duration_ns
 MAX_LINE = 1 << 20
 """Longest line that is read, bytes."""
 TOPIC = "(stream)"
-"""In rows of the ledger, of lines that gave no measurement."""
+"""Topic, in the ledger, of lines that gave no measurement."""
 _MAX_REASON = 200
 _STATUS = {"none": -1, "fix": 0, "sbas": 1, "gbas": 2}  # sensor_msgs/NavSatStatus
 _UNKNOWN, _KNOWN = 0, 3  # NavSatFix.position_covariance_type
-_STAMP_LIMIT_NS = 9 * 10**18  # 64 bits, less room for a time offset
+_STAMP_LIMIT_NS = 9 * 10**18  # leaves room for a time offset in 64 bits
 _ZERO = (0.0, 0.0, 0.0)
 
 
@@ -65,7 +65,10 @@ class _At(NamedTuple):
 
 
 class _Said(Block, strict=True):
-    """Part of a line; unknown keys, and numbers given as strings or bools, are refused."""
+    """Part of a line. Unknown keys, and numbers given as strings or bools, are refused.
+
+    Of each group of keys in `one_of` exactly one is given; of each in `at_most_one_of`, one or none.
+    """
 
     one_of: ClassVar[_Groups] = ()
     at_most_one_of: ClassVar[_Groups] = ()
@@ -80,7 +83,7 @@ class _Said(Block, strict=True):
 
 
 class _Stamped(_Said):
-    """A time: `stamp`, s since 1970 as a decimal string, or `stamp_ns`. Both are exact."""
+    """A time, exact: `stamp`, s since 1970 as a decimal string, or `stamp_ns`."""
 
     stamp: Annotated[str, Field(max_length=20)] | None = None
     stamp_ns: int | None = None
@@ -93,7 +96,7 @@ class _Stamped(_Said):
 
     @property
     def ns(self) -> int | None:
-        """The stamp as sent, ns."""
+        """The stamp as sent, ns; None if the line has none."""
         if self.stamp is None:
             return self.stamp_ns
         whole, _, rest = self.stamp.partition(".")
@@ -101,14 +104,14 @@ class _Stamped(_Said):
 
 
 class _Line(_Stamped):
-    """A measurement; `sensor` may be omitted if only one of its kind is enabled."""
+    """A measurement; `sensor` may be omitted if only one sensor of this kind is enabled."""
 
     one_of: ClassVar[_Groups] = (("stamp", "stamp_ns"),)
-    kind: ClassVar[str]  # of the sensor that says it
+    kind: ClassVar[str]  # kind of the sensor
     sensor: str = ""
 
     def sensor_in(self, config: VesselConfig) -> str | Rejection:
-        """Return the name of the sensor."""
+        """Return the name of the sensor, or why the line is not used."""
         names = [name for name, sensor in config.sensors.items() if sensor.kind == self.kind]
         enabled = list(config.of_kind(self.kind))
         if self.sensor and self.sensor not in names:
@@ -138,7 +141,7 @@ class ImuLine(_Line):
 
 
 class GnssLine(_Line):
-    """A fix of the antenna on WGS 84, with height above the ellipsoid if known; noise east, north, up."""
+    """A fix of the antenna on WGS 84, height above the ellipsoid if known; sigmas or covariance east, north, up."""
 
     kind = "gnss"
     at_most_one_of = (("sigma_m", "cov_enu_m2"),)
@@ -151,13 +154,13 @@ class GnssLine(_Line):
     status: Literal["none", "fix", "sbas", "gbas"] = "fix"
 
     def sensor_in(self, config: VesselConfig) -> str | Rejection:
-        """Return the name of the sensor: of those that read one receiver's fixes by turns the one that reads this fix."""
+        """Return the name of the sensor; of sensors that take turns at one receiver, the one that reads this fix."""
         named = super().sensor_in(config)
         if isinstance(named, Rejection) or not config.sensors[named].takes_turns:
             return named
         read = "rtk" if is_rtk(_STATUS[self.status], self._cov()) else "other"
         readers = [name for name in config.by_turns(named) if config.sensors[name].fixes == read]
-        return readers[0] if len(readers) == 1 else named  # of several receivers without a topic, as it says
+        return readers[0] if len(readers) == 1 else named  # several receivers without a topic: the line tells
 
     def _cov(self) -> Array:
         return _covariance(self.cov_enu_m2, self.sigma_m or _ZERO)
@@ -183,7 +186,7 @@ class HeadingLine(_Line):
     sigma_deg: Positive | None = None
 
     def measured(self, at: _At, config: CompassConfig) -> Measurement | Rejection:
-        """Return the heading; its sigma is the configured one if the line has none, or an implausible one."""
+        """Return the heading, with the configured sigma if the line has none or its sigma is not to be used."""
         yaw = wrap_angle(self.yaw_rad) if self.yaw_rad is not None else yaw_from_heading_deg(self.heading_deg or 0.0)
         sigma_deg = (self.sigma_deg if config.use_reported_sigma else None) or config.sigma_deg
         sigma = float(np.radians(sigma_deg))
@@ -207,7 +210,7 @@ class VelocityLine(_Line):
 
 
 class BodyVelocityLine(_Line):
-    """Velocity along the sensor's axes x, y, z; the configured ones are used."""
+    """Velocity along the sensor's axes x, y, z; the configured axes are used."""
 
     kind = "body_velocity"
     at_most_one_of = (("sigma_mps", "cov_m2ps2"),)
@@ -222,7 +225,7 @@ class BodyVelocityLine(_Line):
 
 
 class ModeSaid(_Said):
-    """One pose of the sensor in world; covariance of x, y, z (m), then small rotations about the axes of world (rad)."""
+    """One pose of the sensor in world; covariance of x, y, z (m), then of small rotations about world axes (rad)."""
 
     at_most_one_of = (("rpy_deg", "quaternion_xyzw"), ("sigma_m", "cov_m_rad"), ("sigma_deg", "cov_m_rad"))
     xyz_m: Triple
@@ -234,8 +237,8 @@ class ModeSaid(_Said):
     probability: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
 
     def message(self) -> SimpleNamespace:
-        """Return the same as a `geometry_msgs/PoseWithCovarianceStamped`."""
-        turn: Sequence[float] = self.quaternion_xyzw or (0.0, 0.0, 0.0, 0.0)  # as drivers write that have none
+        """Return the mode as a `geometry_msgs/PoseWithCovarianceStamped`."""
+        turn: Sequence[float] = self.quaternion_xyzw or (0.0, 0.0, 0.0, 0.0)  # as drivers without orientation write it
         if self.rpy_deg:
             turn = Rotation.from_euler("xyz", self.rpy_deg, degrees=True).as_quat().tolist()
         cov = _covariance(self.cov_m_rad, (*(self.sigma_m or _ZERO), *np.radians(self.sigma_deg or _ZERO)))
@@ -244,14 +247,14 @@ class ModeSaid(_Said):
 
 
 class PoseLine(_Line):
-    """A pose of the sensor in world, with one or several modes; the configured `axes` are used."""
+    """A pose of the sensor in world, with one mode or several; the configured `axes` are used."""
 
     kind = "pose"
     type: Literal["pose"]
     modes: Annotated[tuple[ModeSaid, ...], Field(min_length=1, max_length=64)]
 
     def measured(self, at: _At, config: PoseConfig) -> Measurement | Rejection:
-        """Return the pose with its modes; each passes the decoder of a pose."""
+        """Return the pose with its modes, each of which passes the decoder of poses; a rejection if one does not."""
         modes: list[PoseMode] = []
         for said in self.modes:
             fix = _decoded(POSE, said.message(), at, config)
@@ -299,7 +302,7 @@ def parse(line: bytes, number: int, seq: int, config: VesselConfig) -> Measureme
 
     Args:
         line: one JSON object. number: of the line, from 1. seq: arrival number of a measurement.
-        config: the sensors; their `time_offset_s` is added to the stamps as it is for bags.
+        config: the sensors; their `time_offset_s` is added to the stamps, as when a bag is read.
     """
     stamp_ns, sensor = 0, ""
 
@@ -345,7 +348,7 @@ def parse(line: bytes, number: int, seq: int, config: VesselConfig) -> Measureme
 
 
 def _first_of(error: ValidationError, model: type[Block]) -> str:
-    """Return the first error of a line; a long line may have thousands."""
+    """Return the first error of a line in words; a long line may have thousands."""
     first = error.errors(include_url=False)[0]
     key = ".".join(str(part) for part in first["loc"])[:60]
     if first["type"] == "extra_forbidden":
@@ -363,7 +366,7 @@ def _decoded(msgtype: str, msg: SimpleNamespace, at: _At, config: SensorConfig) 
 
 
 def _xyz(values: Sequence[float]) -> SimpleNamespace:
-    """Return a vector of three, or a quaternion, as ROS messages hold them."""
+    """Return a vector (3,) or a quaternion (4,) as ROS messages hold them."""
     return SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
 
 
@@ -375,5 +378,5 @@ def _twist(v_mps: Sequence[float], cov: Array) -> SimpleNamespace:
 
 
 def _covariance(full: Sequence[Sequence[float]] | None, sigmas: Sequence[float]) -> Array:
-    """Return the covariance, or that of the sigmas; zeros mean 'unknown' to the decoders."""
+    """Return the covariance, if given, or that of the sigmas; zeros mean 'unknown' to the decoders."""
     return np.array(full, dtype=float) if full else np.diag(np.square(sigmas))

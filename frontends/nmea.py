@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sentences of NMEA 0183 (`nmea_msgs/Sentence`, `std_msgs/String`): position, heading, velocity, speed.
 
-Velocities are over ground; speeds are a log's, along the vessel, through the water or (VBW) over ground. pynmeagps parses the fields. Only requested sentences are parsed.
+Velocities are over ground. Speeds are a log's, along the vessel, through the water or (VBW) over ground. Only requested
+sentences are parsed, by pynmeagps.
 """
 
 from __future__ import annotations
@@ -20,28 +21,29 @@ PLACES = ("GGA", "GNS", "RMC", "GLL")
 HEADINGS = ("HDT", "THS", "HDG", "HDM", "SHR")  # PASHR, which makers of INSs share
 VELOCITIES = ("VTG", "RMC")
 SPEEDS = ("VHW", "VBW")
-_SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # tag blocks before it are left out
+_SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),[^\r\n$]*\*[0-9A-Fa-f]{2}")  # without the tag block before it
 _FOREIGN = re.compile(r"!|\$P")
 _NAMED = re.compile(r"[$!]([A-Z][A-Z0-9]{2,9}),([^\r\n$!]*)")  # a sentence of any kind, with a checksum or without
 _CLOCK = re.compile(r"([0-2]\d)([0-5]\d)([0-6]\d(?:\.\d{0,9})?)")
 _SEALED = re.compile(r"\*[0-9A-Fa-f]{2}")
-_NO_HEADING = re.compile(r"PASHR,(?!ATT,)([A-Z]\w*)")  # the same device's satellites, positions and the like
+_NO_HEADING = re.compile(r"PASHR,(?!ATT,)([A-Z]\w*)")  # PASHR of satellites, positions and the like
 _UNREADABLE = (
     exceptions.NMEAParseError, exceptions.NMEAMessageError, exceptions.NMEATypeError, exceptions.NMEAStreamError,
     ValueError, TypeError, KeyError, IndexError, AttributeError,
 )  # fmt: skip
 KNOT_MPS, KM_PER_H_MPS = 1852.0 / 3600.0, 1.0 / 3.6
 SLOW_MPS = 0.1
-"""Up to it a receiver may leave the course out: the velocity is then zero. Taken for a course of 0, its noise is a drift to the north."""
+"""A receiver may leave out the course of a slower speed. Then the velocity is zero: with a course of 0 the noise of the
+speed would be a drift to the north."""
 _HEADING_FIELDS = {"HDT": "headingT", "THS": "headt", "HDM": "headingM", "HDG": "headingM", "ASHR": "trueHdg"}
-# Quality of a fix as GGA has it, from the mode letters of GNS, RMC and GLL.
+# From the mode letters of GNS, RMC and GLL to the quality of a fix as GGA has it.
 _QUALITIES = {"N": 0, "A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8}
 _NOT_MEASURED = {0: "no fix", 6: "dead reckoned by the receiver", 7: "typed in by hand", 8: "simulated by the receiver"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fix:
-    """A position: deg; height above the ellipsoid, m, NaN if unknown; quality as in GGA; horizontal dilution."""
+    """A fix; its height is above the ellipsoid, NaN if unknown, its quality as in GGA; hdop: horizontal dilution."""
 
     latitude_deg: float
     longitude_deg: float
@@ -51,18 +53,21 @@ class Fix:
 
 
 def text_of(msg: Any) -> str:
-    """Return the text of a message of either type."""
+    """Return the text of a Sentence or String message."""
     return str(msg.sentence if hasattr(msg, "sentence") else msg.data)
 
 
 def identities(text: str) -> list[tuple[str, str]]:
-    """Return talker and sentence ('GP', 'GGA') of each distinct sentence; some drivers put a whole burst into a message."""
+    """Return talker and kind ('GP', 'GGA') of each distinct sentence in a message, which may hold a whole burst."""
     telling = (found for found in _SENTENCE.finditer(text) if not _NO_HEADING.match(found[0], 1))
     return list(dict.fromkeys((found[1], found[2]) for found in telling))
 
 
 def unread(text: str) -> list[str]:
-    """Return the names of the sentences of which no sensor reads anything ('GPGSV', 'PSAT', 'AIVDM', 'PASHR,SAT'), and why of those it would read."""
+    """Return the names of the sentences that no sensor reads ('GPGSV', 'PSAT', 'AIVDM', 'PASHR,SAT').
+
+    The name of a readable kind is followed by why it is not read ('GPGGA without a checksum').
+    """
     names = []
     for found in _NAMED.finditer(text):
         name = found[1]
@@ -76,7 +81,7 @@ def unread(text: str) -> list[str]:
 
 
 def time_of_day_s(text: str, sentence: str) -> float:
-    """Return the UTC time of day at which a place ('GPGGA') was measured, s; NaN where it is not told."""
+    """Return the UTC time of day in a sentence of a place ('GPGGA'), s; NaN if it tells none."""
     said = next((f[0] for f in _SENTENCE.finditer(text) if f[1] + f[2] == sentence), "")
     fields = said.partition("*")[0].split(",")
     place = 5 if sentence.endswith("GLL") else 1
@@ -85,10 +90,10 @@ def time_of_day_s(text: str, sentence: str) -> float:
 
 
 def fix(text: str, wanted: Collection[str]) -> Fix | Rejection:
-    """Return the position.
+    """Return the fix of the first accepted sentence.
 
     Args:
-        text: the sentence. wanted: accepted sentences, with a talker ('GPGGA') or of any ('GGA').
+        text: of the message. wanted: accepted sentences, of one talker ('GPGGA') or of any ('GGA').
     """
     said = _read(text, wanted, PLACES, "place")
     if isinstance(said, Rejection):
@@ -111,7 +116,7 @@ def fix(text: str, wanted: Collection[str]) -> Fix | Rejection:
 
 
 def heading_deg(text: str, wanted: Collection[str]) -> float | Rejection:
-    """Return the heading, deg clockwise from north: true, or magnetic (HDM, and HDG without a variation)."""
+    """Return the heading, deg, clockwise from true north, or from magnetic north (HDM, and HDG without a variation)."""
     said = _read(text, wanted, HEADINGS, "heading")
     if isinstance(said, Rejection):
         return said
@@ -128,7 +133,7 @@ def heading_deg(text: str, wanted: Collection[str]) -> float | Rejection:
 
 
 def velocity_mps(text: str, wanted: Collection[str]) -> tuple[float, float] | Rejection:
-    """Return velocity east and north, m/s."""
+    """Return the velocity over ground, east and north, m/s."""
     said = _read(text, wanted, VELOCITIES, "velocity")
     if isinstance(said, Rejection):
         return said
@@ -145,7 +150,11 @@ def velocity_mps(text: str, wanted: Collection[str]) -> tuple[float, float] | Re
 
 
 def log_velocity_mps(text: str, wanted: Collection[str], through: str) -> tuple[float, ...] | Rejection:
-    """Return the velocity by a log, ahead and, where it is told, to port, m/s; of VBW that over ground or that through the water."""
+    """Return the velocity by a log, m/s: ahead and, if told, to port.
+
+    Args:
+        text, wanted: see `fix`. through: 'ground' or 'water', which of the two velocities of VBW.
+    """
     said = _read(text, wanted, SPEEDS, "speed by a log")
     if isinstance(said, Rejection):
         return said
@@ -161,7 +170,11 @@ def log_velocity_mps(text: str, wanted: Collection[str], through: str) -> tuple[
 
 
 def _read(text: str, wanted: Collection[str], kinds: Collection[str], what: str) -> Any | Rejection:
-    """Return the fields of the first accepted sentence, as pynmeagps names them."""
+    """Return the first accepted sentence as pynmeagps parses it, or its rejection.
+
+    Args:
+        text, wanted: see `fix`. kinds: sentences that are read for `what`.
+    """
     sentences = list(_SENTENCE.finditer(text))
     if not sentences and (foreign := _FOREIGN.search(text)):
         return ignored(f"{foreign[0]}...: AIS or a maker's own sentence: not read")
@@ -182,7 +195,7 @@ def _read(text: str, wanted: Collection[str], kinds: Collection[str], what: str)
 
 
 def _quality(said: Any) -> int:
-    """Return the best of a sentence's modes, a letter per constellation; old receivers have a status, or nothing."""
+    """Return the best quality of a sentence's mode letters, one per constellation; of old receivers, of the status."""
     if getattr(said, "status", "A") != "A":
         return 0
     modes = [_QUALITIES[letter] for letter in str(_field(said, "posMode")) if letter in _QUALITIES]
@@ -190,7 +203,7 @@ def _quality(said: Any) -> int:
 
 
 def _field(said: Any, name: str) -> Any:
-    """Return a field; empty if the sentence ends before it."""
+    """Return a field; '' if the sentence ends before it."""
     return getattr(said, name, "")
 
 
@@ -200,12 +213,12 @@ def _number(said: Any, name: str) -> float:
 
 
 def _speed_mps(said: Any, knots: str, km_per_h: str) -> float:
-    """Return a speed given in knots or km/h, m/s; NaN if it is given in neither."""
+    """Return a speed, m/s, of which a sentence gives knots or km/h; NaN if it gives neither."""
     in_knots = _number(said, knots)
     return KNOT_MPS * in_knots if isfinite(in_knots) else KM_PER_H_MPS * _number(said, km_per_h)
 
 
 def _east(said: Any, name: str) -> float:
-    """Return a deviation or variation, east positive; 0 if it is not given."""
+    """Return a deviation or variation, deg, positive east; 0 if it is not given."""
     size = _number(said, name)
     return (-size if _field(said, f"{name}EW") == "W" else size) if isfinite(size) else 0.0

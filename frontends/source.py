@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded bags as one stream of raw messages: ROS 1, ROS 2 sqlite3 and MCAP, split and compressed.
 
-This uses the readers of rosbags but not its `AnyReader`. That registers every type of the bag, so one bad definition on an
-unused topic makes the whole bag unreadable; and a folder whose metadata or last file is damaged can still be read file by file.
+This uses the readers of rosbags but not its `AnyReader`. That registers every type of the bag, so one bad definition on
+an unused topic makes the whole bag unreadable; and a folder whose metadata or last file is damaged can still be read
+file by file.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ from graphloc.time import duration_ns, seconds_between, utc_text
 
 log = logging.getLogger(__name__)
 LATEST_NS = 2**62 - 1
-"""The last time that is worked with (year 2116): a difference of differences still fits 64 bits."""
+"""Latest time that is allowed (year 2116): a difference of differences still fits 64 bits."""
 TF_STATIC, TF_MOVING = "/tf_static", "/tf"
 
 
 class RawMessage(NamedTuple):
-    """A message as recorded, not decoded; `elapsed_ns`: since the bag's first message was recorded."""
+    """A message as recorded, not decoded; `elapsed_ns`: time since the first message of the bag was recorded."""
 
     topic: str
     msgtype: str
@@ -111,7 +112,7 @@ class Bag:
         self._stack.close()
 
     def _cut(self) -> None:
-        """Find the limits of the part, and the number of messages of each topic in it."""
+        """Set the limits of the part, and the number of messages of each topic in it."""
         times: dict[str, list[NDArray[np.int64]]] = {}
         for opened in self._opened:
             for topic, recorded in self._times(opened):
@@ -140,7 +141,7 @@ class Bag:
         )  # fmt: skip
 
     def _times(self, opened: Opened) -> list[tuple[str, NDArray[np.int64]]]:
-        """Return topics and recording times of a file from its index; if that is damaged, from all that is readable."""
+        """Return topics and recording times of a file by its index; if that is damaged, by all readable messages."""
         try:
             return list(recording_times(opened.reader))
         except Exception as error:  # noqa: BLE001 - as below
@@ -169,11 +170,11 @@ class Bag:
     def messages(self, topics: Collection[str], *, whole: bool = False) -> Iterator[RawMessage]:
         """Yield the raw messages of some topics in order of arrival; others are never decompressed.
 
-        Of a part of a bag: those recorded in it, after all of /tf_static, which drivers send only once.
-        At damage in the middle of a file, the file ends, with a line in `warnings`.
+        Of a part of a bag, first all of /tf_static is yielded, which drivers send only once, then what was recorded in
+        the part. Damage in the middle of a file ends the file, with a line in `warnings`.
 
         Args:
-            whole: read the whole bag, for messages that are sent once or do not change.
+            topics: names. whole: read the whole bag, for messages that are sent once or do not change.
         """
         if self.span is None or whole:
             yield from self._merged(topics, (None, None))
@@ -209,7 +210,7 @@ class Bag:
         """Refuse the bag, or the part, if the recorder's clock was set back while these topics were written.
 
         Raises:
-            InputError: it was.
+            InputError: the clock was set back.
         """
         start_ns, end_ns = self._within
         for opened in self._opened:
@@ -229,7 +230,7 @@ class Bag:
 
 
 def unopened(bags: Bags | Bag) -> Bag:
-    """Return the recording at some paths, or itself, not opened yet."""
+    """Return the recording at some paths, not opened yet; a `Bag` is returned as it is."""
     return bags if isinstance(bags, Bag) else Bag(bags)
 
 

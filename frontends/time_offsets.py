@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time offsets of headings, by the gyroscope, and of positions and velocities, by the accelerometer."""
+"""Time offsets of headings by the gyroscope, and of positions and velocities by the accelerometer."""
 
 from __future__ import annotations
 
@@ -27,24 +27,25 @@ from graphloc.frontends.turning import Turning
 from graphloc.signals.series import integral
 from graphloc.time import NS_PER_S
 
-_BLOCK_S = 20.0  # within which gyroscope bias and deviation hardly change, see `heading_time_offset`
-_CLEAR, _HINT, _LEAST_S = 4.0, 2.0, 0.02  # sigmas, s
-_BY_CHANCE = 5e-3  # a few blocks that agree by chance look like many
-_APART_S, _LEAST_OF_WAY_S = 0.05, 0.1  # how closely is looked; from which it is said
-_STEPS = 3  # to an offset of a second in the sharpest turns
-_HIGH_M = 10.0  # 1 sigma of how high above the IMU an antenna is
-_CHORD_S = 2.0  # half the time of a chord of fixes, and of a velocity's integral
+_BLOCK_S = 20.0  # duration of a block, in which gyro bias and deviation hardly change, see `heading_time_offset`
+_CLEAR, _HINT, _LEAST_S = 4.0, 2.0, 0.02  # sigmas of a clear and of a hinted offset; least clear offset
+_BY_CHANCE = 5e-3  # probability by Student's t, where few blocks may agree by chance
+_APART_S, _LEAST_OF_WAY_S = 0.05, 0.1  # steps of the lags that are tried; least offset of a motion that counts
+_STEPS = 3  # iterations, enough for an offset of a second in the sharpest turns
+_HIGH_M = 10.0  # 1 sigma of the height of an antenna above the IMU
+_CHORD_S = 2.0  # half the duration of a chord of fixes, and of a velocity's integral
 
 
 def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: Array) -> tuple[float, float] | None:
     """Return what should be added to the stamps of headings, s, and its sigma; None if the gyroscope does not show it.
 
-    If stamps are off by dt, heading minus integrated rate w is w dt, as long as w hardly changes within dt: hence repeated from where
-    the last step led. Within twenty seconds gyro bias, compass offset and magnetic deviation hardly change, so a straight line per
-    block removes them.
+    If stamps are off by dt, heading minus the integral of the rate w is w dt, as long as w hardly changes within dt.
+    Hence the step is iterated. Within twenty seconds gyro bias, compass offset and magnetic deviation hardly change, so
+    a straight line per block removes them.
 
     Args:
-        turning: integrated rate. stamps_ns: (N,), increasing. angle: (N,) rad, counter-clockwise, unwrapped.
+        turning: the integrated gyroscope. stamps_ns: (N,), increasing. angle: (N,) headings, rad, counter-clockwise,
+            unwrapped.
     """
     at_s = (stamps_ns - turning.origin_ns) / NS_PER_S
     value_s, sigma_s, clear = 0.0, 0.0, _CLEAR
@@ -60,7 +61,11 @@ def heading_time_offset(turning: Turning, stamps_ns: NDArray[np.int64], angle: A
 
 
 def _heading_step(turning: Turning, at: Array, angle: Array) -> tuple[float, float, int] | None:
-    """Return what should be added to times (N,) of headings, s since the turning's origin, to first order, its sigma, and of how many blocks."""
+    """Return what should be added to the times of headings, s, to first order, its sigma, and the number of blocks.
+
+    Args:
+        at: (N,) times, s since the origin of `turning`. angle: (N,), rad.
+    """
     inside = (at > turning.t_s[0] + 1.0) & (at < turning.t_s[-1] - 1.0)
     at, angle = at[inside], angle[inside]
     if len(at) < 50:
@@ -86,11 +91,12 @@ def _heading_step(turning: Turning, at: Array, angle: Array) -> tuple[float, flo
 
 
 class _Windows(NamedTuple):
-    """Windows of one length in which a motion is compared with what is felt.
+    """Windows of one duration in which a motion is compared with what is felt.
 
     Attributes:
-        windows: how many are not alike. along: (N,) the motion's acceleration along its course, times the square of half the length.
-        begun: (B,) the first window of each block. second, first: of `_bending`.
+        windows: number of independent windows.
+        along: (N,) acceleration of the motion along its course, times the square of half the duration, m.
+        begun: (B,) index of the first window of each block. second, first: matrices of `_bending`.
     """
 
     windows: float
@@ -101,7 +107,7 @@ class _Windows(NamedTuple):
 
 
 class MotionOffset(NamedTuple):
-    """What should be added to the stamps of a motion, s, 1 sigma; `clear`: whether it is better than nothing by far."""
+    """What should be added to the stamps of a motion, s; its 1 sigma; whether it is clearly better than no offset."""
 
     value_s: float
     sigma_s: float
@@ -109,16 +115,20 @@ class MotionOffset(NamedTuple):
 
     @property
     def hinted(self) -> bool:
-        """Whether it is likelier than none, though not clearly: as late as a message may be, and by more than two sigmas."""
+        """Whether it is likelier than no offset, though not clearly: over two sigmas, no more than a message's way."""
         return not self.clear and max(_HINT * self.sigma_s, _LEAST_OF_WAY_S) < abs(self.value_s) <= MOST_ON_ITS_WAY_S
 
     def denies(self, other: MotionOffset) -> bool:
-        """Return whether another offset cannot be that of the same clock."""
+        """Return whether another offset is so different that it cannot be of the same clock."""
         apart_s = abs(other.value_s - self.value_s)
         return apart_s > max(_CLEAR * float(np.hypot(self.sigma_s, other.sigma_s)), _LEAST_OF_WAY_S)
 
     def is_of(self, fixes: MeasuredMotion | None, velocity: MeasuredMotion) -> bool:
-        """Return whether this offset of a receiver's velocity is that of its fixes, too, and not what a filter delays the velocity by."""
+        """Return whether this offset of a receiver's velocity holds for its fixes, too.
+
+        Else a filter delays the velocity alone. It is told by the delay between velocity and fixes; if that is unclear,
+        the offset must be no more than a message's way.
+        """
         beside = None if fixes is None else later_than(fixes, velocity)
         if beside is None or abs(self.value_s) < _CLEAR * beside[1]:
             return abs(self.value_s) <= MOST_ON_ITS_WAY_S
@@ -128,13 +138,13 @@ class MotionOffset(NamedTuple):
 def motion_time_offsets(
     felt: Felt, imu: TopicData, motions: Sequence[MeasuredMotion], streams: Mapping[str, TopicData]
 ) -> dict[str, MotionOffset | None]:
-    """Return `motion_time_offset` by source: none so late that it would have been recorded before it was measured.
+    """Return `motion_time_offset` by source, none so large that messages were recorded before they were measured.
 
     Args:
-        imu: whose accelerations are felt. streams: by topic, on one clock.
+        felt: of the IMU. imu: its stream. motions: of the sources. streams: by topic, on one clock.
     """
     imu_s = usual_latency_s(imu.stamps_ns, imu.logs_ns)
-    # Where recording times were made of the stamps they tell nothing.
+    # Recording times that are copies of the stamps tell nothing.
     copied = not imu.recorded and np.array_equal(imu.stamps_ns, imu.logs_ns)
 
     def most_s(motion: MeasuredMotion) -> float:
@@ -147,22 +157,24 @@ def motion_time_offsets(
 
 
 def motion_time_offset(felt: Felt, motion: MeasuredMotion, most_s: float = FARTHEST_LATE_S) -> MotionOffset | None:
-    """Return by how much the stamps of a motion are off, by the accelerometer; None if that does not show it.
+    """Return by how much the stamps of a motion are off, by the accelerometer; None if it does not show that.
 
-    Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. The course is the
-    chord's, and what is felt is taken along the chord of the same speeds by the gyroscope: in a turn where the craft brakes, heading
-    and chord differ, and what it feels across would look like a delay. Pitch swings a high antenna along it, so its height (0 m,
-    give or take ten) is estimated with the offset: c is the correlation with what is felt and that swing together. With c at the best
-    offset and c0 at none, N (c^2 - c0^2) / (1 - c^2) is the gain in chi-square over N windows.
+    Only accelerations along the course count: across it, an antenna ahead of the IMU looks like an early stamp. The
+    course is the direction of a chord of the motion. What is felt is taken along a chord, too, of the same speeds and
+    the turns of the gyroscope: in a turn where the craft brakes, heading and chord differ, and what it feels across
+    would look like a delay. Pitch swings a high antenna along the course, so its height (0 m, give or take ten) is
+    estimated with the offset: c is the correlation with what is felt and that swing together. With c at the best offset
+    and c0 at none, N (c^2 - c0^2) / (1 - c^2) is the gain in chi-square over N windows.
 
     Args:
-        felt: of an IMU in the axes of the vessel. motion: positions, or a velocity over ground.
-        most_s: more cannot be right, as what heels a craft, and is felt as an acceleration, may have it.
+        felt: of an IMU, in the axes of the vessel. motion: positions, or a velocity over ground.
+        most_s: largest offset that can be right. A larger one may fit better by chance, as heel is felt as
+            acceleration.
     """
     if motion.way_m is None:
         return None
     t, at = felt.t_s, felt.times_of(motion)
-    # Where the right offset is farther than is looked, a lesser peak of the same motion takes its place, clearly.
+    # If the right offset lies beyond the lags that are tried, a lesser peak of the same motion seems clear instead.
     lags = np.arange(-FARTHEST_LATE_S, min(most_s, FARTHEST_LATE_S) + 0.5 * _APART_S, _APART_S)
     lengths = list[_Windows]()
     for half_s in windows_of(motion):
@@ -190,7 +202,7 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion, most_s: float = FARTH
         if whole is None:
             continue
         better, value, sigma = whole
-        # A jump of the fixes is an acceleration that some lag fits by chance; how much that tells differs from block to block.
+        # A jump of the fixes is an acceleration that some lag fits by chance: a jackknife over blocks shows that.
         blocks = len(own.begun)
         if blocks > 2:
             rest = (total - sums[:, k] for k in range(blocks))
@@ -206,10 +218,10 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion, most_s: float = FARTH
 
 
 def _best_lag(sums: Array, lags: Array, windows: float) -> tuple[float, float, float] | None:
-    """Return by how much chi-square is better with the best offset than with none, that offset, and its sigma, s; None where there is none.
+    """Return the gain in chi-square by the best offset, that offset, and its sigma, s; None if there is no best one.
 
     Args:
-        sums: (L, 4, 4) of `_sums`, for each of the lags. windows: how many of what they are sums of are not alike.
+        sums: (L, 4, 4) of `_sums`, by lag. lags: (L,), s. windows: number of independent windows in the sums.
     """
     count, mean = sums[0, 0, 0], sums[:, 0, 1:] / sums[0, 0, 0]
     spread = sums[:, 1:, 1:] - count * mean[:, :, None] * mean[:, None]
@@ -227,9 +239,10 @@ def _best_lag(sums: Array, lags: Array, windows: float) -> tuple[float, float, f
 
 
 def later_than(fixes: MeasuredMotion, velocity: MeasuredMotion) -> tuple[float, float] | None:
-    """Return by how much later than fixes a velocity shows the same motion, s, 1 sigma; None of few windows.
+    """Return by how much later than fixes a velocity shows the same motion, s, and its 1 sigma; None of few windows.
 
-    Chords of the fixes and of the velocity's integral differ by that time, times how much the velocity changes between the ends of the chord.
+    Chords of the fixes and of the velocity's integral differ by this time, multiplied by the change of the velocity
+    between the ends of the chord.
     """
     if fixes.way_m is None or velocity.way_m is None:
         return None
@@ -252,9 +265,13 @@ def later_than(fixes: MeasuredMotion, velocity: MeasuredMotion) -> tuple[float, 
 
 
 def _bending(at_s: Array, middle_s: Array, half_s: float) -> tuple[Any, Any]:
-    """Return the sparse matrices (N, M) that take places at M times to the second and the first difference of `bent` about N others.
+    """Return sparse matrices (N, M) from positions at M times to their second and first differences about N times.
 
-    They are the same for all lags: to look up anew between which places each time is, at each lag, took a tenth of the time of `inspect`.
+    The differences are those of `bent`. The matrices are the same for all lags: a search for neighbours at each lag
+    took a tenth of the time of `inspect`.
+
+    Args:
+        at_s: (M,), s. middle_s: (N,), s. half_s: half the duration of a window.
     """
     at = middle_s[:, None] + half_s * np.array([-1.0, 0.0, 1.0])
     before = np.clip(np.searchsorted(at_s, at, side="right") - 1, 0, len(at_s) - 2)
@@ -269,16 +286,17 @@ def _bending(at_s: Array, middle_s: Array, half_s: float) -> tuple[Any, Any]:
 
 
 def _felt_along(felt: Felt, at_s: Array, speed_mps: Array, lengths: Sequence[_Windows], late_s: float) -> list[Array]:
-    """Return `_sums`, for windows of each length, of the sensor's own acceleration along the course, and that of a place a metre above it by pitch alone.
+    """Return the `_sums` of windows of each duration, with the stamps of the motion later by `late_s`.
 
-    Both are times the square of half the length.
+    What is felt is the sensor's own acceleration along the course. The swing is the acceleration, by pitch alone, of a
+    point a metre above it. Both are multiplied by the square of half the duration.
 
     Args:
-        at_s, speed_mps: (M,) of the motion. late_s: what is added to both times.
+        felt: of the IMU. at_s, speed_mps: (M,) of the motion. lengths: windows by duration.
     """
     course = np.exp(1j * np.interp(at_s + late_s, felt.t_s, felt.turned))
     place = integral(at_s, speed_mps * course)
-    # Straight between measurements, as the motion is.
+    # Interpolated linearly between measurements, as the motion is.
     there = np.column_stack([np.interp(at_s + late_s, felt.t_s, way) for way in (felt.way_m, felt.swing_m)])
     sums = []
     for own in lengths:
@@ -289,17 +307,21 @@ def _felt_along(felt: Felt, at_s: Array, speed_mps: Array, lengths: Sequence[_Wi
 
 
 def _sums(along: Array, felt: Array, swung: Array, begun: NDArray[np.int64]) -> Array:
-    """Return the sums (B, 4, 4), over blocks that begin there, of products of 1, an acceleration, what is felt and a swing (N,)."""
+    """Return the sums (B, 4, 4), by block, of products of 1, an acceleration, what is felt, and a swing (N,) each.
+
+    Means over the run are taken off the last three. `begun` (B,) are the indices at which blocks begin.
+    """
     parts = np.stack([np.ones(len(along)), *(part - part.mean() for part in (along, felt, swung))])
     return np.add.reduceat(parts[:, None] * parts, begun, axis=2).transpose(2, 0, 1)
 
 
 def _explained(spread: Array, held: float) -> Array:
-    """Return the correlation (L,) of an acceleration with what is felt and some of a swing; 0 where it is the opposite of what is felt.
+    """Return the multiple correlation (L,) of an acceleration with what is felt and a swing; 0 if it opposes the felt.
 
     Args:
-        spread: (L, 3, 3) sums of products of the three about their means; (L, 2, 2): without the swing.
-        held: what the square of that share costs, beside squares of the acceleration.
+        spread: (L, 3, 3) sums of products of acceleration, felt and swing about their means; (L, 2, 2) without the
+            swing.
+        held: weight of the prior that the height is 0, added to the swing's sum of squares.
     """
     power, by = float(spread[0, 0, 0]), spread[:, 0, 1:]
     among = spread[:, 1:, 1:] + np.diag([0.0, held])[: by.shape[1], : by.shape[1]]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the craft turned, by its gyroscope, and whether an angle turns with it."""
+"""How the craft turned, by its gyroscope, and whether a heading or course turns with it."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ from graphloc.frontends._turns import without_line
 from graphloc.signals.series import rms
 from graphloc.time import NS_PER_S
 
-# Times over which changes of an angle and of a course are compared: a gyro's bias must be small beside them, and the noise average out.
-# Chords of slow fixes are noisier than a compass: the Husky, at 1 m/s, agrees to 0.60 over 6 s, to 0.7 from 10 s on.
+# Times over which changes of a heading and of a course are compared with the gyroscope: so short that the gyro's bias
+# is small, so long that noise averages out. Chords of slow fixes are noisier than a compass: the courses of the Husky,
+# at 1 m/s, correlate by 0.60 over 6 s, by 0.7 from 10 s on.
 _ANGLE_S, _COURSE_S = 2.0, 12.0
-_CORRELATED = 0.5  # correlation of these changes that is believed
-_STEADY_S = 120.0  # within it a gyro's bias and a compass's offset are steady
-_FEWEST = 20  # angles, or changes of them, that tell anything
-# Times the span that changes are compared over: more is a gap. What an angle leaps by beside the turning, of either sense.
+_CORRELATED = 0.5  # least correlation of changes that is believed
+_STEADY_S = 120.0  # duration of a block, in which a gyro's bias and a compass's offset are steady
+_FEWEST = 20  # least number of angles, or of changes, that tell anything
+# A change that takes so many times its span crosses a gap; a step that differs so much from the turning, with either
+# sign, is a leap.
 _GAP, _LEAP_RAD = 1.5, 2.0
-_CLEARLY = 0.5  # what a course and the craft's turns differ by, of what they would if it turned the other way
-_FOLLOWS_DEG, _FOLLOWS = 8.0, 3.0  # most RMS of what a heading and the gyroscope differ by; turns over that
+_CLEARLY = 0.5  # largest RMS of course minus turning, as a share of that with the turning's sign reversed
+_FOLLOWS_DEG, _FOLLOWS = 8.0, 3.0  # a heading follows: largest RMS difference; least ratio of the RMS turn to it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,10 +37,10 @@ class Turning:
 
 
 def against_turning(turning: Turning | None, at_ns: NDArray[np.int64], angle: Array) -> int:
-    """Return +1 where an angle grows as the craft turns to port, -1 where it falls, 0 where nothing tells.
+    """Return +1 if an angle grows as the craft turns to port, -1 if it falls, 0 if that is unclear.
 
     Args:
-        at_ns: (N,), increasing. angle: (N,) rad, unwrapped.
+        turning: the integrated gyroscope; None without an IMU. at_ns: (N,), increasing. angle: (N,) rad, unwrapped.
     """
     a, b = _changes(*_beside(turning, at_ns, angle), _ANGLE_S)
     if len(a) < _FEWEST:
@@ -49,12 +51,13 @@ def against_turning(turning: Turning | None, at_ns: NDArray[np.int64], angle: Ar
 
 
 def course_against_turning(turning: Turning, at_ns: NDArray[np.int64], course: Array) -> int:
-    """Return +1 where a course turns to port as the craft does, -1 where it turns the other way, 0 where nothing tells.
+    """Return +1 if a course turns as the craft does, -1 if it turns the other way, 0 if that is unclear.
 
-    It must turn by about as much as the craft. Turns are compared to half a turn, by which a course is off where the craft goes astern.
+    It must turn by about as much as the craft. Turns are compared modulo half a turn, which a course is off if the
+    craft goes astern.
 
     Args:
-        at_ns, course: as for `against_turning`.
+        turning: the integrated gyroscope. at_ns: (N,), increasing. course: (N,) rad, unwrapped.
     """
     a, b = _changes(*_beside(turning, at_ns, course), _COURSE_S)
     if len(a) < _FEWEST:
@@ -64,12 +67,12 @@ def course_against_turning(turning: Turning, at_ns: NDArray[np.int64], course: A
 
 
 def left_of_turns(turning: Turning, at_ns: NDArray[np.int64], course: Array) -> float:
-    """Return the share of a course's squared changes that a turning does not explain: 0 where it turns as the craft; inf where nothing tells.
+    """Return the share of a course's squared changes that a turning does not explain; inf if too few changes tell.
 
-    Changes are compared to half a turn, as in `course_against_turning`.
+    Changes are compared modulo half a turn, see `course_against_turning`.
 
     Args:
-        at_ns, course: as for `against_turning`.
+        turning, at_ns, course: see `course_against_turning`.
     """
     a, b = _changes(*_beside(turning, at_ns, course), _COURSE_S)
     if len(a) < _FEWEST:
@@ -85,10 +88,12 @@ def _to_half_a_turn(angle: Array) -> Array:
 def follows_turning(turning: Turning | None, at_ns: NDArray[np.int64], yaw: Array) -> bool:
     """Return whether a heading turns as the gyroscope does, by far more than the two differ.
 
-    In blocks of two minutes, a straight line removed from each: the bias of the gyroscope, and what a heading is off by throughout.
+    They are compared in blocks of two minutes. A straight line is removed from each block: the bias of the gyroscope,
+    and a constant offset of the heading.
 
     Args:
-        at_ns: (N,), increasing. yaw: (N,) rad, unwrapped, positive to port.
+        turning: the integrated gyroscope; None without an IMU. at_ns: (N,), increasing.
+        yaw: (N,) rad, unwrapped, counter-clockwise.
     """
     at, own, turned = _beside(turning, at_ns, yaw)
     off = np.unwrap(own - turned)  # across a gap the heading itself may have turned by more than half a turn
@@ -105,10 +110,10 @@ def follows_turning(turning: Turning | None, at_ns: NDArray[np.int64], yaw: Arra
 
 
 def _changes(at: Array, angle: Array, turned: Array, over_s: float) -> tuple[Array, Array]:
-    """Return by how much angles and a turning (N,) at times (N,), s, change within about `over_s`: (M,) of both.
+    """Return by how much angles (N,) and a turning (N,) at times (N,), s, change within about `over_s`: (M,) of each.
 
-    Not across gaps, over which they were not unwrapped by anything that was measured, nor where an angle leaps as no turn does: a course
-    is half a turn off from where the craft goes astern.
+    Changes across gaps are left out: nothing measured tells how to unwrap them. So are changes across a leap of an
+    angle: a course leaps by half a turn where the craft begins to go astern.
     """
     if len(at) < 2:
         return np.zeros(0), np.zeros(0)
@@ -126,7 +131,10 @@ def _changes(at: Array, angle: Array, turned: Array, over_s: float) -> tuple[Arr
 
 
 def _beside(turning: Turning | None, at_ns: NDArray[np.int64], angle: Array) -> tuple[Array, Array, Array]:
-    """Return times (M,), s, of the angles that lie within a turning, these (M,) and the turning (M,) there; empty without one."""
+    """Return the times (M,), s, of angles within the time of a turning, these angles, and the turning at these times.
+
+    Empty without a turning.
+    """
     if turning is None:
         return np.zeros(0), np.zeros(0), np.zeros(0)
     at = (at_ns - turning.origin_ns) / NS_PER_S

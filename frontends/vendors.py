@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of makers' own ROS packages: what each says, as pure functions to plain values, in one table; here, too, those of makers with few types.
+"""Messages of makers' own ROS packages: one table of pure functions from message to plain values.
 
-A message says one thing or several: a receiver's says a place and a velocity. Velocities and headings of most types are in known axes and
-come out as east, north, up; a few drivers write them in north, east, down or in east, north, up, as they are configured: these come out as
-they are, and `convention` of the sensor tells. Axes of an IMU or a Doppler log stay its own.
+Makers with few types of message are read in this module. A message says one thing or several: a receiver's says a place
+and a velocity. Velocities and headings of most types are in known axes, and come out east, north, up. A few drivers
+write north, east, down or east, north, up, as they are configured: these values come out as they are, and `convention`
+of the sensor tells the axes. The axes of an IMU or a Doppler log stay its own.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ from graphloc.frontends._vendor_said import (
     yaw_of,
 )
 
-# The complex urban data set of KAIST: what its player makes of GGA and GST. Older messages have a dilution for the sigmas.
+# KAIST's complex urban data set: its player makes these messages from GGA and GST. Older ones have a dilution, no
+# sigmas.
 
-_VRS_STATUS = {1: 0, 2: 1, 3: 0, 4: 2, 5: 2, 9: 1}  # of NavSatStatus, by quality of GGA
+_VRS_STATUS = {1: 0, 2: 1, 3: 0, 4: 2, 5: 2, 9: 1}  # quality of GGA to NavSatStatus
 
 
 def _vrs_place(msg: Any) -> SaidPlace | Rejection:
@@ -46,11 +48,11 @@ def _vrs_place(msg: Any) -> SaidPlace | Rejection:
     return place_of(place, _VRS_STATUS[quality], max(north, east), up)
 
 
-# PX4: microseconds since boot, or of the computer's clock where its agent synchronises them.
+# PX4: its times are microseconds since boot, or of the computer's clock if its agent synchronises them.
 
 _PX4_STATUS = {2: 0, 3: 0, 4: 1, 5: 2, 6: 2}
 _PX4_2D, _PX4_NO_ACCEL = 2, 0x7FFFFFFF
-_LATEST_US = 4 * 10**15  # year 2096: nanoseconds in 64 bits
+_LATEST_US = 4 * 10**15  # year 2096: as nanoseconds it fits 64 bits
 
 
 def _px4_imu(msg: Any) -> SaidInertial | Rejection:
@@ -76,7 +78,7 @@ def _px4_place(msg: Any) -> SaidPlace | Rejection:
 def _px4_velocity(msg: Any) -> SaidVelocity | Rejection:
     if int(msg.fix_type) not in _PX4_STATUS or not msg.vel_ned_valid:
         return rejected("no velocity (vel_ned_valid false, or no fix)")
-    sigma = sigma_of(float(msg.s_variance_m_s))  # a sigma, for all its name
+    sigma = sigma_of(float(msg.s_variance_m_s))  # a sigma, despite its name
     return SaidVelocity((float(msg.vel_e_m_s), float(msg.vel_n_m_s), -float(msg.vel_d_m_s)), sigma, sigma)
 
 
@@ -92,10 +94,10 @@ def _px4_stamp_ns(msg: Any, _log_ns: int) -> int | None:
     return 1000 * at_us if 0 < at_us < _LATEST_US else None
 
 
-# Doppler logs: x ahead, y to starboard, z down, where they point.
+# Doppler logs: axes x ahead, y to starboard, z down, in which direction they are mounted.
 
 _DVL_THROUGH = {1: "ground", 2: "water"}
-_DVL_BEAMS = 3  # that a velocity takes
+_DVL_BEAMS = 3  # least number of beams for a velocity
 
 
 def _waterlinked_along(msg: Any) -> SaidAlong | Rejection:
@@ -110,13 +112,13 @@ def _waterlinked_along(msg: Any) -> SaidAlong | Rejection:
 
 def _dvl_along(msg: Any) -> SaidAlong | Rejection:
     v, beams = xyz_of(msg.velocity), int(msg.num_good_beams)
-    # Drivers of instruments that tell a velocity alone fill in neither beams nor flags.
+    # Drivers of instruments that only tell a velocity fill in neither beams nor flags.
     if 0 < beams < _DVL_BEAMS or not (msg.beam_velocities_valid or any(v)):
         return rejected(f"no velocity ({beams} good beams)")
     return SaidAlong(v, tuple(float(c) for c in msg.velocity_covar), _DVL_THROUGH.get(int(msg.velocity_mode), ""))
 
 
-# geographic_msgs: poses are what a filter says, points are not told. Axes are east, north, up, heights above the ellipsoid.
+# geographic_msgs: poses are taken for a filter's output, points are not. Axes are east, north, up, heights ellipsoidal.
 
 
 def _geo_point(msg: Any) -> SaidPlace | Rejection:
@@ -125,12 +127,12 @@ def _geo_point(msg: Any) -> SaidPlace | Rejection:
 
 
 def _geo_covariance(msg: Any) -> tuple[Any, tuple[float, float, float]]:
-    """Return the pose, and variances, horizontal, vertical and of the yaw; 0: not told."""
+    """Return the pose, and its horizontal, vertical and yaw variances, 0 if not told."""
     if not hasattr(msg.pose, "covariance"):
         return msg.pose, (0.0, 0.0, 0.0)
     if len(msg.pose.covariance) != 36:
         raise ValueError(f"a covariance of {len(msg.pose.covariance)} values")
-    one, other, up, _, _, yaw = (float(c) for c in msg.pose.covariance[::7])  # north or east first, as drivers like
+    one, other, up, _, _, yaw = (float(c) for c in msg.pose.covariance[::7])  # north or east first, by driver
     return msg.pose.pose, (max(one, other), up, yaw)
 
 
@@ -167,11 +169,11 @@ VENDORS: dict[str, tuple[Part, ...]] = {
     **dict.fromkeys(("dvl_msgs/msg/DVL", "waterlinked_a50_ros_driver/msg/DVL"), (Part("body_velocity", _waterlinked_along),)),
     **dict.fromkeys(("marine_acoustic_msgs/msg/Dvl", "acoustic_msgs/msg/Dvl"), (Part("body_velocity", _dvl_along, through=True),)),
 }  # fmt: skip
-"""By type of message: what it says, the first thing first."""
+"""By type of message: its parts; the first one gives the stream that is named as the topic."""
 
 STAMPS: dict[str, Callable[[Any, int], int | None]] = {
     **UBLOX_STAMPS,
     **NOVATEL_STAMPS,
     **dict.fromkeys([t for t in VENDORS if t.startswith("px4_msgs/")], _px4_stamp_ns),
 }
-"""Of types whose stamp is not that of a header: from message and recording time, ns."""
+"""By type of message without a header's stamp: from message and recording time (ns) to stamp (ns)."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """BL's matcher as printed (alg. 2 to 5, eq. 3.16), a baseline.
 
-Edges of the image form a binary image, and so do lines through the scan's stacked points; a particle swarm finds the rotation
-at which the best shift of one over the other has most pixels in common. The shift is not limited to a window, and no other
-maximum is considered: the filter's 2 m gate (alg. 6) does that. The cloud is level, unlike BL's.
+Edges of the image form a binary image, and so do lines through the scan's stacked points; a particle swarm finds the
+rotation at which the best shift of one over the other has most pixels in common. The shift is not limited to a window,
+and no other maximum is considered: the filter's 2 m gate (alg. 6) does that. The cloud is level, unlike BL's.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ Cells = NDArray[np.int64]
 
 # Printed.
 _SIDE_M, _SIDE_PX = 150.0, 940  # 938 x 940 there; ours are square
-_NEW_IMAGE_M = 5.0  # the image is kept until the estimate is that far from where it was loaded (section 3.4.2)
+_NEW_IMAGE_M = 5.0  # the image is kept until the estimate is so far from where it was loaded (section 3.4.2)
 _DRY_M = 0.3
 _MOST_FREQUENT = 3000  # alg. 3
-_MORE_THAN = 15  # alg. 4: points that a grid cell needs
+_MORE_THAN = 15  # alg. 4: a grid cell needs more points
 _PARTICLES, _ITERATIONS, _SEARCH_DEG = 10, 6, 5.0
 _C1, _C2, _W, _V_MAX_DEG = 2.0, 2.0, 0.4, 1.0  # alpha and dt are 1, and so are not written below
 _MOST_POINTS = 288_000  # Nm, eq. 3.32
@@ -63,11 +63,12 @@ class _Edges:
 class BLMatcher:
     """Matches scans to one image as BL does.
 
-    The same seed gives the same answers to the same calls; the swarm's chance and the loaded image go on from call to
-    call, as in a run. Of the configuration it takes the hull alone: BL has no window, and no reach but the image's.
+    One seed gives the same answers to the same sequence of calls; the swarm's random numbers and the loaded image carry
+    over from call to call, as in a run. Of the configuration it uses the hull alone: BL has no window, and no reach but
+    that of the image.
 
     Args:
-        config: an aerial sensor's. image: what to match to. seed: of RANSAC and the swarm.
+        config: of an aerial sensor. image: to be matched to. seed: of RANSAC and the swarm.
     """
 
     def __init__(self, config: AerialConfig, image: AerialImage, seed: int = 0) -> None:
@@ -76,7 +77,7 @@ class BLMatcher:
         self._edges: _Edges | None = None
 
     def match(self, cloud: LevelCloud, prior: Prior) -> Match:
-        """Match a cloud by BL alg. 5, from the prior's pose; its sigmas are not asked.
+        """Match a cloud by BL alg. 5, from the prior's pose; the prior's sigmas are not used.
 
         Returns:
             One mode, of probability 1, at a whole pixel from the prior; or none, and `why_not`. Its covariance is
@@ -84,7 +85,7 @@ class BLMatcher:
             where Nk counts all points of the cloud. `found` is empty: BL's lines are no outline.
 
         Raises:
-            InputError: the image does not reach there.
+            InputError: the image does not cover the prior.
         """
         edges = self._edges_around(prior.pose[:2])
         points = cloud.points_m[np.isfinite(cloud.points_m).all(axis=1)]
@@ -116,7 +117,7 @@ class BLMatcher:
         return self._edges
 
     def _lines(self, points_m: Array, patch: Patch, pose: Array) -> Array:
-        """X_reduced (M, 2) in level, m, of points (N, 3): selected, most frequent, on lines (section 3.3.4)."""
+        """Return X_reduced (M, 2) in level, m, of points (N, 3): selected, most frequent, on lines (section 3.3.4)."""
         keep = points_m[:, 2] >= _DRY_M
         if self._hull is not None:
             keep &= ~inside(self._hull, points_m[:, :2])
@@ -138,14 +139,14 @@ def _turn(yaw: float) -> Array:
 
 
 def _laid(points_m: Array, patch: Patch, pose: Array) -> Cells:
-    """Return column and row (K, 2) of the points (N, 2) in level, seen from a pose (3,), that are on the image (eq. 3.13)."""
+    """Return column and row (K, 2), on the image, of points (N, 2) in level, seen from a pose (3,) (eq. 3.13)."""
     cells = np.rint(patch.cells(points_m @ _turn(pose[2]).T + pose[:2])).astype(np.int64)
     return np.asarray(cells[((cells >= 0) & (cells < _SIDE_PX)).all(axis=1)])
 
 
 def _canny(patch: Patch) -> NDArray[np.bool_]:
     """Return the edges B_w (rows, columns) of the grey image, with thresholds from its gradients as in Matlab."""
-    # 16: gradients go on as whole numbers, and a faint one must not be rounded away.
+    # Times 16: gradients become integers, and a faint one must not be rounded to 0.
     grey = 16.0 * cv2.cvtColor(patch.pixels, cv2.COLOR_RGB2GRAY).astype(np.float32)
     soft = cv2.GaussianBlur(grey, (0, 0), _BLUR_PX)
     dx, dy = (np.rint(cv2.Sobel(soft, cv2.CV_32F, *d, ksize=1)).astype(np.int16) for d in ((1, 0), (0, 1)))
@@ -158,13 +159,13 @@ def _canny(patch: Patch) -> NDArray[np.bool_]:
 
 
 def _most_frequent(cells: Cells) -> Cells:
-    """Return the most frequent pairs (K, 2) among pairs (N, 2) (BL alg. 3); of equals, the first in Matlab's order."""
+    """Return the most frequent of pairs (N, 2) as (K, 2) (BL alg. 3); among equals, the first in Matlab's order."""
     pairs, count = np.unique(cells, axis=0, return_counts=True)
     return np.asarray(pairs[np.argsort(-count, kind="stable")[:_MOST_FREQUENT]])
 
 
 def _line(cells: Cells, rng: np.random.Generator) -> Cells:
-    """Return the pixels (L, 2) of the line through pixels (K, 2): RANSAC, then least squares of the inliers, from end to end."""
+    """Return the pixels (L, 2) of the line through pixels (K, 2): RANSAC, then least squares of the inliers."""
     first = rng.integers(len(cells), size=_TRIALS)
     second = (first + rng.integers(1, len(cells), size=_TRIALS)) % len(cells)
     along = (cells[second] - cells[first]).astype(float)
@@ -180,7 +181,7 @@ def _line(cells: Cells, rng: np.random.Generator) -> Cells:
 
 
 def _swarm(objective: Callable[[float], float], rng: np.random.Generator) -> float:
-    """Return the rotation, deg, of the lowest objective that BL alg. 1 evaluates; as printed, particles may leave +-5 deg."""
+    """Return the rotation, deg, with the lowest objective in BL alg. 1; as printed, particles may leave +-5 deg."""
     x = rng.uniform(-_SEARCH_DEG, _SEARCH_DEG, _PARTICLES)
     v = rng.uniform(-_SEARCH_DEG, _SEARCH_DEG, _PARTICLES)
     own, own_f = x.copy(), np.full(_PARTICLES, np.inf)
@@ -198,9 +199,10 @@ def _swarm(objective: Callable[[float], float], rng: np.random.Generator) -> flo
 
 
 def _correlation(cells: Cells, edges: _Edges) -> NDArray[np.float32]:
-    """Return C of eq. 2.17: element (o, l) counts the pixels (K, 2) on edges when shifted o rows down, l columns right.
+    """Return C of eq. 2.17: element (o, l) counts the pixels (K, 2) on edges if shifted o rows down, l columns right.
 
-    Indices past the image's side are negative shifts. Counts are integers, rounded so that rounding errors do not decide order.
+    Indices beyond the image's side are negative shifts. Counts are rounded to integers, so that rounding errors do not
+    decide between equals.
     """
     lit = np.zeros((_PADDED_PX, _PADDED_PX), dtype=np.float32)
     lit[cells[:, 1], cells[:, 0]] = 1.0
@@ -210,7 +212,10 @@ def _correlation(cells: Cells, edges: _Edges) -> NDArray[np.float32]:
 
 
 def _best_shift_m(shared: NDArray[np.float32], cell_m: float) -> Array:
-    """Return the shift (2,), east and north, of the highest count; of equals the nearest (our choice: the gate passes no other)."""
+    """Return the shift (2,), m, east and north, of the highest count.
+
+    Among equals it is the smallest one: our choice, since the filter's gate passes no other.
+    """
     shifts = np.argwhere(shared == shared.max())
     shifts = np.where(shifts < _SIDE_PX, shifts, shifts - _PADDED_PX)
     down, right = shifts[np.hypot(*shifts.T).argmin()]

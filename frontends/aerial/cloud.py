@@ -26,20 +26,20 @@ _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f
 _TIME_FIELDS = ("time", "t", "timestamp", "offset_time", "time_offset", "time_stamp")
 _UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 _USUAL_UNIT_S = {"f4": 1.0, "u4": 1e-9}  # since the header: Velodyne's seconds; Ouster's and Livox's nanoseconds
-_LONGEST_S = 1.0  # from header to point; scans of 1 Hz
+_LONGEST_S = 1.0  # longest time from header to point: scans come at 1 Hz or faster
 _SHORTEST_TURN_S = 0.008  # the fastest LiDARs give 100 clouds a second
-_PACKET_POINTS = 4096  # a packet has no more (128 beams x 16 columns, both returns) ...
-_SHORTEST_PACKET_S = 0.25e-3  # ... and lasts 0.5 ms (Velodyne, both returns) or longer
-_LONGEST_SMALL_S = 0.5  # a small cloud that says more may as well be a packet in a smaller unit
-_BIN_NS = 2_000_000  # a pose each 2 ms is often enough: 2 cm at 10 m/s
+_PACKET_POINTS = 4096  # most points of a packet (128 beams x 16 columns, both returns)
+_SHORTEST_PACKET_S = 0.25e-3  # least duration of a packet; Velodyne's, with both returns, lasts 0.5 ms
+_LONGEST_SMALL_S = 0.5  # a small cloud whose times are longer may as well be a packet in a smaller unit
+_BIN_NS = 2_000_000  # one pose per 2 ms suffices: 2 cm at 10 m/s
 _NEWEST_NS = 10**9
 _CHUNK = 1 << 15  # points at a time: their rotations (2 MB) stay in the cache
-_said: set[tuple[str, str]] = set()  # a bag has thousands of scans, each with the same fault
+_said: set[tuple[str, str]] = set()  # warnings that were given: thousands of scans of a bag may have one fault
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
-    """A scan as recorded: points (N, 3) m in the LiDAR's axes, the stamp of each (N,) ns, and that of its header."""
+    """A scan as recorded: LiDAR, header's stamp, points (N, 3), m, in the LiDAR's axes, and their stamps (N,), ns."""
 
     lidar: str
     stamp_ns: int
@@ -47,19 +47,20 @@ class Cloud:
     stamps_ns: NDArray[np.int64]
 
     def where(self, mask: NDArray[np.bool_]) -> Cloud:
-        """Return the points of a mask (N,)."""
+        """Return the cloud with the points of a mask (N,) only."""
         return self if mask.all() else replace(self, points_m=self.points_m[mask], stamps_ns=self.stamps_ns[mask])
 
 
 def decode_cloud(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
     """Return the finite points of a `PointCloud2`, each with its time if a field has it.
 
-    Times may be s, ms, us or ns, since the header's stamp or absolute, on its clock or another (`_since_header_s`). Points with a time
-    more than 1 s from the header's, or not finite, are dropped, since a clamped time would misplace them. If no interpretation of the
-    times makes sense, all points get the header's stamp, with one warning. Of fields with equal names the first counts (as in PCL).
+    Times may be s, ms, us or ns, since the header's stamp or absolute, on its clock or another (`_since_header_s`).
+    Points with a time more than 1 s from the header's, or not finite, are dropped, since a clamped time would misplace
+    them. If no interpretation of the times makes sense, all points get the header's stamp, with one warning. Of fields
+    with equal names the first counts (as in PCL).
 
     Args:
-        stamp_ns: the header's.
+        msg: the message. stamp_ns: of its header. lidar: name.
 
     Raises:
         ValueError: no x, y, z, a field of unknown type or outside the point, or fewer bytes than stated.
@@ -83,7 +84,7 @@ def decode_cloud(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
 
 
 def _layout(msg: Any) -> np.dtype[Any]:
-    """Return the fields to read of a point, its coordinates first."""
+    """Return the fields of a point that are read, coordinates first."""
     fields: dict[str, Any] = {}
     for field in msg.fields:
         fields.setdefault(field.name, field)
@@ -117,18 +118,22 @@ def _rows(msg: Any, count: int) -> NDArray[np.uint8]:
 
 
 def _since_header_s(time: NDArray[Any], stamp_ns: int, count: int, lidar: str) -> Array:
-    """Return a driver's time field in s since the header's stamp; NaN or implausible values if it makes no sense.
+    """Return a driver's time field in s since the header's stamp; 0 if no interpretation makes sense.
 
-    The first of these that fits all but 1 % at each end:
+    Taken is the first interpretation that fits all values but 1 % at each end:
 
     1. Since the header, in the usual unit of the field's type, if the latest is within a scan or a packet.
-    2. Absolute, in the unit that makes it about as large as the header's stamp. If the two differ by more than 1 s (TAI is
-       37 s ahead of UTC), as 4.
-    3. Since the header, in another unit, if that gives the length of a scan. Not that of a packet, which is the same as a slow
-       scan in a unit 1000 times smaller; the header is right for a packet to within its length.
-    4. Absolute on another clock, such as time since boot, in the unit that gives the length of a scan. Only the differences
-       are used: the first point is at the header's stamp, as for Ouster, Hesai and Livox (and in `LaserScan`, and by
-       Autoware's rules); for RoboSense, whose headers are of the last point, this is wrong by one turn.
+    2. Absolute, in the unit that makes it about as large as the header's stamp. If the two differ by more than 1 s (TAI
+       is 37 s ahead of UTC), as in 4.
+    3. Since the header, in another unit, if that gives the duration of a scan. The duration of a packet does not count:
+       it equals a slow scan in a unit 1000 times smaller; and the header's stamp is right to within a packet.
+    4. Absolute on another clock, such as time since boot, in the unit that gives the duration of a scan. Only
+       differences are used: the first point is at the header's stamp, as for Ouster, Hesai and Livox (and in
+       `LaserScan`, and by Autoware's rules). For RoboSense, whose headers are of the last point, this is wrong by one
+       turn.
+
+    Args:
+        time: (N,) values of the field. stamp_ns: of the header. count: number of points. lidar: name, for warnings.
     """
     with np.errstate(all="ignore"):  # signalling NaNs; 1e308 in ns
         value = time.astype(float)
@@ -138,7 +143,7 @@ def _since_header_s(time: NDArray[Any], stamp_ns: int, count: int, lidar: str) -
         low, high = _ends(finite)
         spread, furthest = high - low, max(abs(low), abs(high))
         if furthest == 0.0:
-            return np.zeros(len(value))  # a driver that does not fill it
+            return np.zeros(len(value))  # the driver does not fill the field
         step = 1.0 if time.dtype.kind in "iu" else float(np.spacing(time.dtype.newbyteorder("=").type(furthest)))
         units = [u for u in _UNITS_S if step * u <= 1e-3]  # whole seconds, or an epoch in float32, are no point times
         longest = _LONGEST_S if count > _PACKET_POINTS else _LONGEST_SMALL_S
@@ -163,14 +168,17 @@ def _since_header_s(time: NDArray[Any], stamp_ns: int, count: int, lidar: str) -
 
 
 def _ends(value: Array) -> tuple[float, float]:
-    """Return smallest and largest value without 1 % at each end, which may be outliers; of fewer than 10 values, of all."""
+    """Return the smallest and largest value, without 1 % at each end, which may be outliers, of ten values or more."""
     cut = -(-len(value) // 100) if len(value) >= 10 else 0
     ordered = np.partition(value, (cut, len(value) - 1 - cut))
     return float(ordered[cut]), float(ordered[len(value) - 1 - cut])
 
 
 def _is_epoch(low_s: float, high_s: float, stamp_s: float) -> bool:
-    """Return whether times are as large as a stamp, to a half; soon after zero, times since it look the same."""
+    """Return whether times are as large as a stamp, within half of it.
+
+    Not of stamps near zero, where times since the header look the same.
+    """
     return (
         stamp_s > 4.0 * _LONGEST_S
         and high_s - low_s <= _LONGEST_S
@@ -202,17 +210,18 @@ def level(
     waterline_m: float,
     others: Sequence[Sequence[Cloud]] = (),
 ) -> LevelCloud:
-    """Return the points of clouds in `level` at a time, each from where the track has its LiDAR at the time of the point.
+    """Return the points of clouds in `level` at a time, with each LiDAR placed by the track at the time of the point.
 
-    Points that the track does not cover are omitted. For the others,
+    Points that the track does not cover are omitted. For all others,
     p_level = R_level_world (p_world_body + R_world_body (R_body_lidar p_lidar + t_body_lidar) - p_world_level),
     with the pose of the body at the middle of the 2 ms that contain the point.
 
     Args:
-        mounts: T_body_lidar by name. waterline_m: height of the waterline in body. others: clouds of each turn before and after.
+        clouds: of the newest turns. mounts: T_body_lidar by name. track: of the body. at_ns: time of `level`.
+        waterline_m: height of the waterline in body. others: clouds of each other turn.
 
     Raises:
-        InputError: the track does not cover `at_ns`, or no point of the newest clouds (stamped within 1 s of it).
+        InputError: the track does not cover `at_ns`, or no point of the clouds that are stamped within 1 s of it.
     """
     newest = [k for k, c in enumerate(clouds) if abs(c.stamp_ns - at_ns) <= _NEWEST_NS]
     names = ", ".join(dict.fromkeys(c.lidar for c in ([clouds[k] for k in newest] or clouds))) or "no LiDAR"
@@ -251,7 +260,8 @@ def _covered(
     """Return the points that a track covers, and when they were seen, to 2 ms.
 
     Returns:
-        The clouds without other points; the times (T,), ns; for each cloud which of these are its points'; and which is `at_ns`.
+        The clouds with these points only; the distinct times (T,), ns; for each cloud, the index of each point's time;
+        the index of `at_ns`.
     """
     kept = [_during(c, track) for c in clouds]
     bins, rows = _shared_bins([*(c.stamps_ns // _BIN_NS for c in kept), np.array([at_ns // _BIN_NS])])
@@ -267,7 +277,7 @@ def _covered(
 
 
 def _move(points: Array, R: Array, t: Array, row: NDArray[np.int64], out: Array) -> None:
-    """Write R[row] points + t[row]; one rotation matrix per point would take 72 bytes each."""
+    """Write R[row] points + t[row] into out (N, 3), in chunks: a rotation matrix per point takes 72 bytes."""
     for k in range(0, len(points), _CHUNK):
         part = slice(k, k + _CHUNK)
         np.einsum("nij,nj->ni", R.take(row[part], axis=0), points[part], out=out[part])
@@ -279,9 +289,9 @@ def _during(cloud: Cloud, track: Trajectory) -> Cloud:
 
 
 def _shared_bins(numbers: list[NDArray[np.int64]]) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
-    """Return the distinct numbers, ascending, and for each array the indices of its own among them.
+    """Return the distinct numbers of several arrays, ascending, and for each array the indices of its values in them.
 
-    Like `np.unique` without sorting; the numbers are within a track, so a table of all of them is small.
+    It is like `np.unique` without sorting. The numbers are within a track, so a table of their range is small.
     """
     some = [n for n in numbers if len(n)]
     first, last = min(int(n.min()) for n in some), max(int(n.max()) for n in some)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """An aerial image resampled on the grid of world, part by part.
 
-GDAL reads it: a file, an MBTiles, or a folder of tiles (`tiles.py`), with any kind of pixels. Since grid north is not true north
-and a map's metre not always a metre, no affine map between image and world is assumed: the image is sampled point by point (on
-a net of 8 m, linearly between, with errors below a millimetre).
+GDAL reads it: a file, an MBTiles, or a folder of tiles (`tiles.py`), with any kind of pixels. Grid north is not true
+north, and a map's metre is not always a metre, so no affine transformation between image and world is assumed: points
+are transformed one by one, on a net of 8 m, and interpolated linearly, with errors below a millimetre.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from graphloc.frontends.aerial.tiles import describe_tiles
 Pixels = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 _NET_M = 8.0
-_LOOSE_M = 1.5  # a tie to WGS 84 that is less sure than that is worth a word; those of ETRS 89 say 1 m
+_LOOSE_M = 1.5  # a tie to WGS 84 with a larger uncertainty is warned of; ties of ETRS 89 state 1 m
 _SAMPLES, _SAMPLE_PX = 8, 128
 _WKT_CHARS = 100_000
-_PALETTE_PX = 300_000_000  # read at once of an image with a palette, which cannot be read coarser
+_PALETTE_PX = 300_000_000  # most pixels that are read at once of an image with a palette, which cannot be read coarser
 
 log = logging.getLogger(__name__)
 
@@ -61,16 +61,17 @@ class Patch:
 class AerialImage:
     """A georeferenced image.
 
-    - A file that GDAL reads: GeoTIFF, JPEG 2000, VRT, PNG with world file and CRS (.prj), ..., of any CRS, rotated or not.
-    - An MBTiles file with jpg, png or webp tiles: its deepest zoom level.
-    - A folder of tiles z/x/y.png, jpg or webp: its deepest zoom level, see `tiles.describe_tiles`.
+    - A file that GDAL reads: GeoTIFF, JPEG 2000, VRT, PNG with world file and CRS (.prj), ..., of any CRS, rotated or
+    not. - An MBTiles file with jpg, png or webp tiles: its deepest zoom level. - A folder of tiles z/x/y.png, jpg or
+    webp: its deepest zoom level, see `tiles.describe_tiles`.
 
-    One band is grey, a palette is expanded, of more bands those named red, green, blue are taken, else the first
-    three. Pixels of more than 8 bits are stretched: 2 to 98 % of samples over the whole image become 0 to 255, the
-    same for all bands. No data is where an alpha band, a mask or a nodata value says so, and where a tile is missing.
+    One band is grey; a palette is expanded; of more bands, the ones named red, green, blue are taken, else the first
+    three. Pixels of more than 8 bits are stretched: the 2 % and 98 % points of samples over the whole image become 0
+    and 255, for all bands alike. There is no data where an alpha band, a mask or a nodata value says so, and where a
+    tile is missing.
 
     Raises:
-        InputError: it cannot be read, or has no georeference.
+        InputError: the image cannot be read, or has no georeference.
     """
 
     def __init__(self, path: Path, datum: Datum) -> None:
@@ -90,10 +91,10 @@ class AerialImage:
             self._darkest, self._brightest = self._span()
 
     def patch(self, centre_m: Array, half_m: float, cell_m: float) -> Patch:
-        """Return the square of `half_m` around a point (2,) in world.
+        """Return the square with half side `half_m` around a point (2,) in world, in cells of `cell_m`.
 
         Raises:
-            InputError: the image does not cover it, has no data there, or cannot be read there.
+            InputError: the image does not cover the square, has no data in it, or cannot be read there.
         """
         n = int(np.ceil(2.0 * half_m / cell_m))
         west, north = centre_m[0] - half_m + 0.5 * cell_m, centre_m[1] + half_m - 0.5 * cell_m
@@ -105,17 +106,17 @@ class AerialImage:
         lowest, highest = uv.min(axis=(1, 2)), uv.max(axis=(1, 2))
         if not np.isfinite([lowest, highest]).all():  # beyond where the CRS is defined
             raise elsewhere
-        eastward = np.hypot(*np.diff(uv[:, ::n], axis=2))  # of the first row
+        eastward = np.hypot(*np.diff(uv[:, ::n], axis=2))  # steps along the first row
         if eastward.max() > 2.0 * np.median(eastward):
             raise InputError(
                 f"{self._path}: the date line of its CRS runs through it {centre_m[0]:.0f} m east, {centre_m[1]:.0f} m "
                 "north of the datum: gdalwarp it to the UTM zone there"
             )
-        # Pixels a cell along u and v, as they are on the ground: the CRS may count feet, degrees, or half metres.
+        # Pixels per cell along u and v, by the ground: units of the CRS may be feet, degrees, or half metres.
         finer = np.hypot((uv[:, :, -1] - uv[:, :, 0]).mean(axis=1), (uv[:, -1] - uv[:, 0]).mean(axis=1)) / (n - 1)
-        shrink = 2 ** max(0, int(np.log2(0.5 * finer.min())))  # read 2 pixels a cell or more, and not hundreds
+        shrink = 2 ** max(0, int(np.log2(0.5 * finer.min())))  # read two pixels per cell or more, but not hundreds
         if self._palette is not None:
-            shrink = 1  # its numbers have no mean, and the nearest pixel is half a pixel off
+            shrink = 1  # indices of a palette cannot be averaged, and the nearest pixel is half a pixel off
         size = np.array([self._source.width, self._source.height])
         low = np.clip(shrink * np.floor(lowest / shrink - 2.0), 0, size).astype(int)
         high = np.clip(shrink * np.ceil(highest / shrink + 3.0), 0, size).astype(int)
@@ -128,9 +129,9 @@ class AerialImage:
             )
         image, has = self._read(low, high - low, shrink)
         scale = np.array(has.shape[::-1]) / (high - low)
-        if (finer * scale).max() > 1.5:  # the grid is coarser than what was read: average, do not pick
+        if (finer * scale).max() > 1.5:  # the grid is coarser than the pixels that were read: average these
             image = cv2.GaussianBlur(image, (0, 0), sigmaX=0.4 * finer[0] * scale[0], sigmaY=0.4 * finer[1] * scale[1])
-        uv *= scale[:, None, None]  # in place: memory for more of these takes longer to get than to fill
+        uv *= scale[:, None, None]  # in place: to allocate more such arrays takes longer than to fill them
         uv += ((0.5 - low) * scale - 0.5)[:, None, None]
         at = uv.astype(np.float32)
         pixels = cv2.remap(image, at[0], at[1], cv2.INTER_LINEAR)
@@ -148,11 +149,11 @@ class AerialImage:
 
     def _pixels_of_grid(self, west: float, north: float, n: int, cell_m: float) -> Array:
         """Return image column and row (2, n, n) of a grid in world."""
-        net_m = max(_NET_M, 2.0 * cell_m)  # a picture of kilometres needs no net finer than its pixels
+        net_m = max(_NET_M, 2.0 * cell_m)  # a patch of kilometres needs no net finer than its cells
         knots = np.linspace(0.0, n - 1.0, max(2, int(np.ceil(n * cell_m / net_m)) + 1))
         columns, rows = np.meshgrid(knots, knots)
         net = self._pixels_of(np.column_stack([west + columns.ravel() * cell_m, north - rows.ravel() * cell_m]))
-        # Linear between knots, by a product: cv2.remap would round to a 32nd of their distance, 0.25 m.
+        # Linear interpolation by a matrix product: cv2.remap would round to 1/32 of a knot's distance, 0.25 m.
         at = np.arange(n) * (len(knots) - 1) / (n - 1)
         between = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(len(knots))))
         uv = np.empty((2, n, n))
@@ -182,7 +183,7 @@ class AerialImage:
         return np.ascontiguousarray(np.moveaxis(np.broadcast_to(bands, (3, rows, columns)), 0, 2)), has
 
     def _span(self) -> tuple[float, float]:
-        """Return the 2 and 98 % quantiles of samples over the image."""
+        """Return the 2 % and 98 % quantiles of samples over the image."""
         size = np.array([self._source.width, self._source.height])
         least = np.minimum(size, _SAMPLE_PX)
         found = [np.zeros(0)]
@@ -201,17 +202,17 @@ class AerialImage:
 
 
 def _opened(path: Path, datum: Datum) -> Any:
-    """Return what GDAL reads of an image file, or of a folder of tiles.
+    """Return an image file, or a folder of tiles, as opened by GDAL.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: it cannot be opened.
     """
     try:
         folder = path.is_dir()
     except OSError as error:  # such as no permission, a name that is too long
         raise InputError(f"{path}: {error.strerror}") from None
     name = describe_tiles(path, datum) if folder else path
-    # Cut at the bounds that it states, an MBTiles is off by half a pixel (seen with GDAL 3.10: 5 cm of 16).
+    # An MBTiles cut at its stated bounds is off by up to half a pixel (seen with GDAL 3.10: 5 cm, of pixels of 16 cm).
     options = {"USE_BOUNDS": "NO"} if path.suffix.lower() == ".mbtiles" else {}
     try:
         with warnings.catch_warnings():
@@ -222,7 +223,7 @@ def _opened(path: Path, datum: Datum) -> Any:
 
 
 def _tie(path: Path, wkt: str, datum: Datum) -> Any:
-    """Return the transformation from longitude and latitude (WGS 84) to the CRS of an image, the best one near the datum.
+    """Return the best transformation, near the datum, from longitude and latitude (WGS 84) to the CRS of an image.
 
     Raises:
         InputError: there is none.
@@ -233,7 +234,7 @@ def _tie(path: Path, wkt: str, datum: Datum) -> Any:
         crs = CRS.from_wkt(wkt)
         here = AreaOfInterest(lon, lat, lon, lat)  # which tie to WGS 84 is best depends on where
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # that a better tie needs a grid: said below
+            warnings.simplefilter("ignore", UserWarning)  # a better tie needs a grid file; loose ones are logged below
             ties = TransformerGroup(4326, crs, always_xy=True, area_of_interest=here).transformers
     except ProjError as error:
         raise InputError(f"{path}: its CRS cannot be used ({_line(error)})") from None
@@ -255,7 +256,7 @@ def _palette_of(source: Any) -> Pixels:
 
 
 def _beside(path: Path) -> str:
-    """Return the CRS (WKT) in the .prj beside an image, where agencies put it with a world file; empty if there is none."""
+    """Return the CRS (WKT) in the .prj beside an image, which agencies add to a world file; '' if there is none."""
     try:
         return path.with_suffix(".prj").read_text(encoding="utf-8")[:_WKT_CHARS]
     except (OSError, ValueError):
@@ -288,5 +289,5 @@ def _why_not(source: Any, path: Path, *, has_crs: bool) -> str:
 
 
 def _line(error: Exception) -> str:
-    """Return GDAL's message without the ones that follow from it."""
+    """Return the first line of GDAL's first message, which causes the others."""
     return " ".join(str(error.__cause__ or error).splitlines()[:1])

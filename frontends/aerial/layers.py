@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Likelihood layers of edges and water in an aerial image, to which a scan is compared.
 
-A layer is (bins, rows, columns) with values 0 to 1: proximity to an edge or shore of that direction. Edges have an undirected
-orientation (`EDGE_BINS` over 180 deg), shores a direction from water to land (`SHORE_BINS` over 360 deg). Edges are detected on
-a grid twice as fine: blurred to a cell, the bright kerb of a quay moves 0.1 m outwards.
+A layer is (bins, rows, columns) with values 0 to 1: the proximity to an edge or shore of the bin's direction. Edges
+have an undirected orientation (`EDGE_BINS` over 180 deg), shores a direction from water to land (`SHORE_BINS` over 360
+deg). Edges are detected on a grid twice as fine: with the blur of a coarse cell, the bright kerb of a quay moves 0.1 m
+outwards.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ FINE = 2
 EDGE_BINS, SHORE_BINS = 8, 12
 _EDGE_SIGMA_M, _SHORE_SIGMA_M = 0.25, 0.3
 _CANNY = (50.0, 130.0)
-_RIM_M = 0.75  # a segmented rim is that near to the shore
-_LIKE_WATER = 3.0  # sigmas of the colours of water, within which others are
-_MARGIN_M = 0.5  # the image's own rim is no edge
+_RIM_M = 0.75  # the rim of segmented water is so near to the shore
+_LIKE_WATER = 3.0  # a colour within so many sigmas of those of water is water
+_MARGIN_M = 0.5  # margin along the border of the image, which is no edge
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +47,9 @@ class Layers:
     """Log-likelihoods in steps of `unit` (whole numbers, 0 to 255).
 
     Attributes:
-        low, tall: (EDGE_BINS, rows, columns) of low and tall faces. shores: (SHORE_BINS, rows, columns) of first
-            returns; None if no water is known. drawn: (rows, columns) cells that a user's lines pass through, or None.
+        patch: the image on the coarse grid. unit: nats. low, tall: (EDGE_BINS, rows, columns) of low and tall faces.
+        shores: (SHORE_BINS, rows, columns) of first returns; None if no water is known.
+        drawn: (rows, columns) cells that a user's lines pass through; None without lines.
     """
 
     patch: Patch
@@ -59,7 +61,7 @@ class Layers:
 
 
 def weighed(patch: Patch, sources: Sequence[tuple[Layer, Layer | None, Weights]], drawn: Mask | None) -> Layers:
-    """Combine the edges and shores of several sources, each with its own weights, by the maximum.
+    """Return the layers of several sources, each (edges, shores, weights), combined by the maximum.
 
     A sum would count twice what two sources show.
     """
@@ -68,7 +70,7 @@ def weighed(patch: Patch, sources: Sequence[tuple[Layer, Layer | None, Weights]]
     def over(parts: Sequence[tuple[Layer, float]]) -> Pixels:
         most = np.zeros(parts[0][0].shape, dtype=np.uint8)
         for layer, weight in parts:
-            for values, so_far in zip(layer, most, strict=True):  # one by one they stay in the processor's cache
+            for values, so_far in zip(layer, most, strict=True):  # bin by bin, which stays in the processor's cache
                 np.maximum(so_far, np.rint(values * np.float32(weight / unit)).astype(np.uint8), out=so_far)
         return most
 
@@ -85,7 +87,7 @@ def weighed(patch: Patch, sources: Sequence[tuple[Layer, Layer | None, Weights]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edges:
-    """Canny edges on the fine grid: mask (rows, columns), and direction (N,) of the gradient there, rad in world."""
+    """Canny edges on the fine grid: mask (rows, columns), and gradient's direction (N,) at its cells, rad in world."""
 
     where: Mask
     gradient_rad: Array
@@ -101,19 +103,19 @@ def find_edges(fine: Patch) -> Edges:
 
 
 def edge_layer(fine: Patch, edges: Edges) -> Layer:
-    """Return edges by the direction of their line in world, bin k around k * 180 / EDGE_BINS deg."""
+    """Return the layer of edges by the direction of their line in world, bin k around k * 180 / EDGE_BINS deg."""
     rows, columns = np.nonzero(edges.where)
     return _drawn(fine, rows, columns, edges.gradient_rad + 0.5 * np.pi, np.pi, EDGE_BINS, _EDGE_SIGMA_M)
 
 
 def shore_layer(fine: Patch, edges: Edges, water: Mask) -> Layer:
-    """Return shores by the direction from water to land, bin k around k * 360 / SHORE_BINS deg.
+    """Return the layer of shores by the direction from water to land, bin k around k * 360 / SHORE_BINS deg.
 
-    The shore is the first edge next to water: the eroded mask is grown up to the edges within `_RIM_M` of its rim, and to the rim
-    where there are none.
+    The shore is the first edge next to water: the mask of water is eroded, then grown up to the edges within `_RIM_M`
+    of its rim, or a little beyond the rim where there are none.
 
     Args:
-        water: (rows, columns) of the coarse grid.
+        fine, edges: patch and edges on the fine grid. water: (rows, columns) of the coarse grid.
     """
     reach = round(_RIM_M / (FINE * fine.cell_m))
     mask, disc = water.astype(np.uint8), _disc(reach)
@@ -141,7 +143,7 @@ def drawn_layers(fine: Patch, drawn: VectorMap) -> tuple[Layer, Layer]:
     """Return the edges and shores of a vector layer within a patch."""
     a, b, kept = _clipped(drawn.segments_m, fine)
     angle = np.arctan2(*(b - a).T[::-1])
-    count = np.ceil(np.abs(b - a).max(axis=1) / fine.cell_m).astype(np.int64)  # as many as a line has pixels
+    count = np.ceil(np.abs(b - a).max(axis=1) / fine.cell_m).astype(np.int64)  # number of pixels of a line
     which = np.repeat(np.arange(len(a)), count)
     t = (np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[which]
     columns, rows = fine.cells(a[which] + t[:, None] * (b - a)[which]).T
@@ -154,7 +156,7 @@ def drawn_layers(fine: Patch, drawn: VectorMap) -> tuple[Layer, Layer]:
 
 
 def _clipped(segments_m: Array, fine: Patch) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Return ends (K, 2) of the parts of segments (S, 2, 2) within a patch, and the segment of each (Liang, Barsky)."""
+    """Return both ends (K, 2) of the parts of segments (S, 2, 2) within a patch, and their indices (Liang-Barsky)."""
     a, d = segments_m[:, 0], segments_m[:, 1] - segments_m[:, 0]
     rows, columns = fine.inside.shape
     low = np.array([fine.west_m, fine.north_m - (rows - 1) * fine.cell_m])
@@ -163,7 +165,7 @@ def _clipped(segments_m: Array, fine: Patch) -> tuple[Array, Array, NDArray[np.i
         t = np.stack([(low - a) / d, (high - a) / d])
     t = np.where(d == 0.0, np.where((a >= low) & (a <= high), [[[-np.inf]], [[np.inf]]], np.nan), t)
     begin, end = np.maximum(t.min(axis=0).max(axis=1), 0.0), np.minimum(t.max(axis=0).min(axis=1), 1.0)
-    (kept,) = np.nonzero(end > begin)  # NaN: beside it
+    (kept,) = np.nonzero(end > begin)  # NaN, of a segment beside the patch, fails
     return a[kept] + begin[kept, None] * d[kept], a[kept] + end[kept, None] * d[kept], kept
 
 
@@ -175,16 +177,20 @@ def _well_inside(patch: Patch) -> Mask:
 def _drawn(
     fine: Patch, rows: NDArray[Any], columns: NDArray[Any], angle: Array, turn: float, bins: int, sigma_m: float
 ) -> Layer:  # fmt: skip
-    """Draw lines into a layer of the coarse grid: exp(-d^2 / 2 sigma^2) beside a single line.
+    """Return pixels of lines as a layer of the coarse grid: exp(-d^2 / 2 sigma^2) at a distance d from a single line.
 
-    Each counts for the bins on both sides of its angle. An oblique line has fewer pixels for its length.
+    A pixel counts for the two bins next to its angle. It is weighed by length: an oblique line has fewer pixels.
+
+    Args:
+        fine: patch of the pixels. rows, columns, angle: (N,) of each pixel; angle in rad. turn: range of angles, rad.
+        bins: of the layer. sigma_m: sigma.
     """
     shape = (fine.inside.shape[0] // FINE, fine.inside.shape[1] // FINE)
     along = angle if turn < 6.0 else angle + 0.5 * np.pi
     weight = 1.0 / (FINE * np.maximum(np.abs(np.cos(along)), np.abs(np.sin(along))))
     lower = np.floor(np.mod(angle, turn) * (bins / turn)).astype(np.int64) % bins
     sigma = sigma_m / (FINE * fine.cell_m)
-    # Shared out between the four nearest cells, so that a line keeps its place to less than a cell.
+    # Each pixel is shared out between the four nearest cells, so that lines keep their positions to less than a cell.
     at = (np.stack([rows, columns]) - 0.5 * (FINE - 1)) / FINE
     corner = np.floor(at).astype(np.int64)
     part = at - corner
@@ -204,7 +210,7 @@ def _drawn(
 
 
 def coarse_patch(fine: Patch) -> Patch:
-    """Return a patch with cells of twice the size, each the mean of four."""
+    """Return a patch with cells twice as wide, each the mean of four cells."""
     rows, columns = (n // FINE * FINE for n in fine.inside.shape)
     size = (columns // FINE, rows // FINE)
     off = 0.5 * (FINE - 1) * fine.cell_m
@@ -218,10 +224,13 @@ def coarse_patch(fine: Patch) -> Patch:
 
 
 def segment_water(patch: Patch, free: Mask) -> Mask:
-    """Return where water is (rows, columns): cells similar to those that a LiDAR saw as free water, and connected to them.
+    """Return where water is (rows, columns): cells that look like the free water a LiDAR saw, and are connected to it.
 
-    Robust colour statistics in LAB; a darker colour counts a fifth, so that water in shadow stays water. Blur keeps the rim some
-    decimetres inside.
+    Colours are compared in LAB by robust statistics. A darker lightness counts a fifth, so that water in shadow stays
+    water. The blur keeps the rim some decimetres inside the shore.
+
+    Args:
+        patch: the image. free: (rows, columns) cells that a LiDAR saw as free water.
     """
     lab: NDArray[np.float32] = cv2.cvtColor(patch.pixels, cv2.COLOR_RGB2LAB).astype(np.float32)
     lab = np.asarray(cv2.GaussianBlur(lab, (0, 0), 1.5), dtype=np.float32)
@@ -234,7 +243,7 @@ def segment_water(patch: Patch, free: Mask) -> Mask:
     keep = (np.abs(sample - middle) < 3.0 * spread).all(axis=1)
     cov = np.cov(sample[keep].T) + np.diag([4.0, 1.0, 1.0])
     mean = sample[keep].mean(axis=0).astype(np.float32)
-    # In a shadow there is less light of the same colour: chroma (OpenCV's is 128 more) falls with lightness.
+    # In shadow there is less light of the same colour: chroma, of which 128 is OpenCV's 0, falls with lightness.
     dimmed = np.clip(mean[0] / np.maximum(lab[..., 0], 1.0), 1.0, 3.0)
     off = lab - mean
     off[..., 1:] = (lab[..., 1:] - 128.0) * dimmed[..., None] - (mean[1:] - 128.0)

@@ -21,8 +21,8 @@ from graphloc.recording import Mounts
 from graphloc.time import NS_PER_S, stamps_of
 from graphloc.trajectory import Trajectory
 
-_JITTER_S = 0.05  # stamps are not a clock
-_AHEAD_NS = 300_000_000  # an IMU's messages are not later than that; a stamp farther ahead is on another clock
+_JITTER_S = 0.05  # jitter of stamps
+_AHEAD_NS = 300_000_000  # an IMU's messages are no later than this; a stamp farther ahead is of another clock
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +30,8 @@ class Matched:
     """A match and its stamp, or the reason why there is none.
 
     Attributes:
-        since: the match before; None: there is none.
+        stamp_ns, match: None: there is none. why_not: reason; '' if there is a mode.
+        since: distance and time from the match before; None: there is none.
     """
 
     stamp_ns: int
@@ -44,16 +45,16 @@ class Pace:
 
     def __init__(self, config: AerialConfig) -> None:
         self._config = config
-        self._last: tuple[Array, int] | None = None  # place and stamp of the last turn that was due
+        self._last: tuple[Array, int] | None = None  # position and stamp of the last turn that was due
 
     def is_due(self, stamp_ns: int, track: Trajectory) -> bool:
-        """Return whether a turn is due; if it is, the next one is at a distance from it."""
+        """Return whether a turn is due; if it is, the interval to the next one starts with it."""
         config, here = self._config, track.at(np.array([stamp_ns])).p_world_m[0, :2]
         if self._last is not None:
             moved_m = float(np.hypot(*(here - self._last[0])))
             waited_s = (stamp_ns - self._last[1]) / 1e9
             too_soon = waited_s < config.every_s - _JITTER_S or (moved_m < config.every_m and waited_s < config.still_s)
-            if waited_s >= 0.0 and too_soon:  # a clock that was set back begins anew
+            if waited_s >= 0.0 and too_soon:  # after a clock was set back, the next turn is due
                 return False
         self._last = (here, stamp_ns)
         return True
@@ -62,13 +63,14 @@ class Pace:
 class LiveMatcher:
     """Matches turns as they come, at the configured interval.
 
-    It may be called by one thread at a time. It holds open files, so another process makes its own: its arguments, turns and tracks
-    can be pickled. Results can be too, but a `Match` holds the map around it (some 50 MB): send its `fix`. Do not fork for it:
-    numba's OpenMP threads do not survive that.
+    It may be called by one thread at a time. It holds open files, so another process makes a matcher of its own: the
+    arguments, turns and tracks can be pickled. So can results, but a `Match` holds the map around it (some 50 MB): send
+    its `fix`. Do not fork: numba's OpenMP threads do not survive that.
 
     Args:
-        folder: base of relative paths of maps. mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name. around_s: how far off in time
-            turns that were shown may be, to be matched with another one.
+        config: of the aerial sensor. folder: base of relative paths of maps. datum: origin of world.
+        mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name.
+        around_s: largest difference in time of turns that were shown and the turn with which they are matched.
 
     Raises:
         InputError: a map cannot be used.
@@ -81,18 +83,18 @@ class LiveMatcher:
         self._matcher = _matcher(config, folder, datum)
         self._submap = Submap(config, mounts, around_s)
         self._pace = Pace(config)
-        self._before: tuple[Array, int] | None = None  # place and stamp of the last match that had a mode
+        self._before: tuple[Array, int] | None = None  # position and stamp of the last match that had a mode
 
     def offer(self, turn: Turn, track: Trajectory, *, growing: bool = True) -> Matched | Literal["wait"] | None:
-        """Match a turn if it is due. Turns are offered in order, and the same one again after "wait".
+        """Match a turn if it is due. Turns are offered in order; after "wait" the same turn is offered again.
 
         Args:
-            track: body in world around the turn, two poses or more. The submap is placed by this track alone, without parts
-                that it no longer covers.
+            turn: to match. track: body in world around the turn, two poses or more. The submap is placed by this track
+                alone, without parts that it no longer covers.
             growing: whether the track will extend further; otherwise nothing waits.
 
         Returns:
-            A match; or the reason why there is none of a turn that is damaged or outside of the track for good. None: not due.
+            A match, or why there is none, if the turn is damaged or outside the track for good. None: it is not due.
             "wait": the track ends slightly before the turn; nothing has changed.
         """
         if turn.why_not:
@@ -116,19 +118,19 @@ class LiveMatcher:
         return item
 
     def show(self, turn: Turn, track: Trajectory) -> None:
-        """Show a turn that others may be matched with, if it can be used; it may be one that is not offered yet."""
+        """Show a turn, if it can be used, with which other turns may be matched; it need not have been offered yet."""
         if not turn.why_not and not outside(turn, track):
             self._submap.show(turn, track.at(np.array([turn.stamp_ns])).p_world_m[0, :2])
 
     def take(self, turn: Turn) -> None:
-        """Take a turn that a track covers as the newest."""
+        """Make a turn, which a track covers, the newest one."""
         self._submap.take(turn)
 
     def match(self, track: Trajectory) -> Matched:
         """Match the newest turn, together with others that were shown, whether due or not."""
         newest, config = self._submap.newest, self._config
         stamps = np.sort(np.concatenate([c.stamps_ns for c in newest.clouds] + [np.array([newest.stamp_ns])]))
-        at_ns = int(stamps[len(stamps) // 2])  # not a median, which goes through floats
+        at_ns = int(stamps[len(stamps) // 2])  # numpy's median would go through floats
         try:
             now, others = self._submap.clouds()
             cloud = level(now, self._mounts, track, at_ns, config.waterline_m, others)
@@ -144,7 +146,7 @@ class LiveMatcher:
 
 
 def outside(turn: Turn, track: Trajectory) -> str:
-    """Return which scans are outside of a track; empty if none is."""
+    """Return a line on the scans of a turn if any is outside a track; '' if none is."""
     stamps = stamps_of(turn.clouds)
     if track.covers(stamps).all():
         return ""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Map that scans are matched to: an image, a user's lines, or both; layers are computed once for each part of it."""
+"""The map to which scans are matched: an image, a user's lines, or both. Layers are computed once for each tile."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ log = logging.getLogger(__name__)
 
 _CELL_M = 0.25
 _TILE_M = 100.0  # a patch serves all priors of one tile
-_KEPT = 4  # patches, about 50 MB each
-_ON_IT = 0.7
-_TRIES = 3  # a first scan may have seen no water, a disk may have failed it
+_KEPT = 4  # patches that are kept, about 50 MB each
+_ON_IT = 0.7  # a line passes through cells with a larger value of its layer
+_TRIES = 3  # a first scan may have seen no water, or a disk may have failed
 
-# Fitted by benchmarks/tune_matcher.py on harbours drawn by chance; docs/decisions/0006. A tall face on an image may be on a
-# shadow as well; on a drawn line it is a house, for no boat is as tall.
+# Fitted by benchmarks/tune_matcher.py on harbours drawn by chance; docs/decisions/0006. On an image a tall face may be
+# on a shadow as well; on a drawn line it is a house, since no boat is as tall.
 ON_IMAGE, ON_LINES = Weights(low=0.88, tall=0.50, shore=1.70), Weights(low=0.74, tall=2.60, shore=1.74)
 
 
@@ -47,7 +47,8 @@ class Map:
     """Layers of `image` and `vector` of an aerial sensor, part by part.
 
     Args:
-        on_image, on_lines: weights of either, to fit them; default: the fitted ones.
+        config: of the aerial sensor. folder: base of relative paths. datum: origin of world.
+        on_image, on_lines: weights of edges of the image and of lines, given to fit them; default: the fitted ones.
 
     Raises:
         InputError: neither is given, or one cannot be used.
@@ -72,7 +73,7 @@ class Map:
         self._tries: Counter[tuple[int, int]] = Counter()
 
     def around(self, pose: Array, found: Outline) -> Layers:
-        """Return the layers around a pose (3,); water is what looks like the water that a scan saw from there.
+        """Return the layers around a pose (3,); water is where the image looks like the water that a scan saw there.
 
         Raises:
             InputError: the map does not cover it.
@@ -91,7 +92,7 @@ class Map:
                 raise
         while len(self._kept) >= _KEPT:
             self._kept.pop(next(iter(self._kept)))
-        self._kept[tile] = layers  # the last used is the last to go
+        self._kept[tile] = layers  # at the end: the least recently used is dropped first
         return layers
 
     def _made(self, middle_m: Array, pose: Array, found: Outline) -> Layers:
@@ -134,7 +135,7 @@ def _blank(middle_m: Array, half_m: float, cell_m: float) -> Patch:
 
 
 def _seen_water(patch: Patch, pose: Array, found: Outline) -> NDArray[np.bool_]:
-    """Return the cells that the scan saw as water, if the pose is right."""
+    """Return the cells (rows, columns) that the scan saw as water, if the pose is right."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     at = found.water_m @ np.array([[c, s], [-s, c]]) + pose[:2]
     cells = np.rint(patch.cells(at)).astype(int)

@@ -17,17 +17,19 @@ from graphloc.frontends.aerial.layers import Layer, Layers
 from graphloc.frontends.aerial.scan import Outline
 
 STEP_DEG = 0.5
-_LEAST_SHARE = 0.01  # of the posterior that a mode must have
-_NARROW, _FINER = 5, 5  # a mode of fewer cells across is looked at between them, so much finer
-_FLOOR = np.array([0.05, 0.05, np.radians(0.1)])  # m, rad: no image tells more
-# A ridge through all of the window that falls by less than so many nats, times the root of its length in m, says nothing along itself.
-_CHANCE, _MEASURED_M = 2.5, 13.0  # of longer windows it was not measured: no more is asked there
-_UNTOLD_M = 20.0  # 1 sigma along it; less would say the window itself, match after match
-_ACROSS_M = 0.6  # half width of a ridge, around its line
+_LEAST_SHARE = 0.01  # least share of the posterior that a mode must have
+_NARROW, _FINER = 5, 5  # a mode of fewer cells across is interpolated on a grid so much finer
+_FLOOR = np.array([0.05, 0.05, np.radians(0.1)])  # least sigmas, m and rad: no image tells more
+# A ridge through the whole window that falls by less than so many nats, times the root of its length in m, tells
+# nothing along itself. It was measured up to this length; for longer windows the limit stays.
+_CHANCE, _MEASURED_M = 2.5, 13.0
+_UNTOLD_M = 20.0  # 1 sigma along a ridge: a smaller one would be told by the window, match after match
+_ACROSS_M = 0.6  # half width of a ridge
 _RIDGE_STEP_DEG = 3.0
-_PARALLEL = 0.3  # share of a scan's lines that cross a ridge, up to which it is of parallel walls: of rows of boats 0.33 and more
-_NOTHING = 1e-9  # of the best pose's mass: a piece beside the end of a ridge
-# TBB, Numba's first choice, warns on stderr where the one that is installed is older than it likes.
+# Largest share of a scan's lines across a ridge, if this is of parallel walls; of rows of boats it is 0.33 and more.
+_PARALLEL = 0.3
+_NOTHING = 1e-9  # least mass, relative to the best pose's, of a piece of a ridge: avoids a division by 0
+# TBB, Numba's first choice, warns on stderr if an old version of it is installed.
 numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined]
 
 
@@ -41,7 +43,7 @@ class SearchGrid:
 
 
 def grid_around(layers: Layers, prior: Array, half_m: float, half_deg: float) -> SearchGrid:
-    """Return the candidates around a pose (3,): east, north, yaw, on the cells of the layers."""
+    """Return the candidates around a pose (3,), east, north, yaw, on the cells of the layers."""
     patch = layers.patch
     column, row = np.rint(patch.cells(prior[None, :2])[0]).astype(int)
     k = np.arange(-int(np.ceil(half_m / patch.cell_m)), int(np.ceil(half_m / patch.cell_m)) + 1)
@@ -55,10 +57,10 @@ def grid_around(layers: Layers, prior: Array, half_m: float, half_deg: float) ->
 
 @compiled(parallel=True, fastmath=True)
 def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, columns):  # type: ignore[no-untyped-def]
-    """Return the sum over points of weight x layer for each yaw, row and column of the grid: (H, rows, columns).
+    """Return the sum over points of weight times layer, for each yaw, row and column of the grid: (H, rows, columns).
 
-    A point is assigned to one of the cells around it by a low-discrepancy sequence: rounded, all points of a wall along the grid
-    would be off by the same part of a cell.
+    A point is assigned to one of the cells around it by a low-discrepancy sequence. With rounding, all points of a wall
+    along the grid would be off by an equal part of a cell.
     """
     bins, height, width = layer.shape
     out = np.zeros((len(yaw), rows, columns), dtype=np.float32)
@@ -80,8 +82,8 @@ def _laid(layer, p_m, angle, weight, yaw, col0, row0, cell_m, turn, rows, column
 def log_likelihood_of(found: Outline, layers: Layers, grid: SearchGrid) -> Layer:
     """Return the log-likelihood of each pose of the grid (H, R, C).
 
-    The sum over lines grows with their number, but so do chance and common errors (boats at other berths than in the image), so it is
-    divided by the root of the amount of evidence.
+    The sum over lines grows with their number, but so do chance and common errors (boats at other berths than in the
+    image), so it is divided by the root of the amount of evidence.
     """
     patch = layers.patch
     col0, row0 = np.rint(patch.cells(np.array([[grid.east_m[0], grid.north_m[0]]]))[0]).astype(int)
@@ -120,14 +122,15 @@ def modes_of(
 ) -> tuple[list[Mode], float]:
     """Return the modes of a posterior (H, R, C), best first, and the probability that none is right.
 
-    A ridge that goes straight through the window and hardly falls, of a scan whose lines go along it as well (a quay without an end in
-    view), is one mode, whose covariance leaves open where along it the vessel is: how complete the map's edges are varies along a wall,
-    and that is no place.
+    A ridge that goes straight through the window and hardly falls is one mode, if the lines of the scan go along it as
+    well (a quay without an end in view). Its covariance leaves the position along the ridge open: the score varies
+    along a wall with the completeness of the map's edges, which tells no position.
 
     Args:
-        none_log: log-likelihood of a pose where the scan fits by chance, relative to the mean of all.
+        log_likelihood, grid: of the poses.
+        none_log: log-likelihood of a pose at which the scan fits by chance, relative to the mean of all poses.
         alien: probability that the scan shows something that the image does not, whatever the score.
-        normals: (2, 2), as in `Outline`; None: nothing that the scan shows lies across a ridge.
+        most: largest number of modes. normals: (2, 2), see `Outline`; None: no line of the scan lies across a ridge.
     """
     top = float(log_likelihood.max())
     mass = np.exp(log_likelihood.astype(float) - top)
@@ -167,10 +170,14 @@ def modes_of(
 
 
 def _open_along(profile: NDArray[np.float32], spot: NDArray[np.int64], height: float, cell_m: float) -> Array | None:
-    """Return the direction (2,), rows and columns, of a straight ridge through a peak from border to border; None if there is none.
+    """Return the direction (2,) of a straight ridge through a peak from border to border; None if there is none.
 
     Args:
-        profile: (R, C) highest log-likelihood of any yaw in a cell and its neighbours. spot: (2,) row and column. height: of the peak.
+        profile: (R, C) highest log-likelihood of any yaw in a cell and its neighbours.
+        spot: (2,) row and column of the peak. height: its log-likelihood. cell_m: size of a cell.
+
+    Returns:
+        Components along rows and columns.
     """
     size = np.array(profile.shape)
     angle = np.radians(np.arange(0.0, 180.0, _RIDGE_STEP_DEG))
@@ -187,14 +194,14 @@ def _open_along(profile: NDArray[np.float32], spot: NDArray[np.int64], height: f
 
 
 def _told(along: Array, normals: Array, yaw_rad: float) -> float:
-    """Return the share of a scan's lines that say where along a direction (2,), rows and columns, it is, at a heading."""
+    """Return the share of a scan's lines that tell the position along a direction (2,), rows and columns, at a yaw."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     ahead = np.array([c * along[1] - s * along[0], -s * along[1] - c * along[0]])  # in body; rows run south
     return float(ahead @ normals @ ahead)
 
 
 def _beside(along: Array, spot: NDArray[np.int64], shape: tuple[int, ...], cell_m: float) -> NDArray[np.bool_]:
-    """Return which cells (R, C) lie beside a line through a peak."""
+    """Return which cells (R, C) are within `_ACROSS_M` of a line through a peak."""
     row, column = np.indices(shape)
     return np.asarray(
         np.abs((row - spot[0]) * along[1] - (column - spot[1]) * along[0]) * cell_m <= _ACROSS_M + 0.5 * cell_m
@@ -204,7 +211,7 @@ def _beside(along: Array, spot: NDArray[np.int64], shape: tuple[int, ...], cell_
 def _moments_across(
     part: tuple[NDArray[np.int64], ...], mass: Array, grid: SearchGrid, along: Array, cell_m: float
 ) -> tuple[Array, Array]:
-    """Return mean (3,) and covariance (3, 3) of a ridge with each piece of its length alike, and open along it."""
+    """Return mean (3,) and covariance (3, 3) of a ridge, all pieces of its length weighed alike, and open along it."""
     values = np.column_stack([grid.east_m[part[2]], grid.north_m[part[1]], grid.yaw_rad[part[0]]])
     direction = np.array([along[1], -along[0]])  # rows run south
     piece = np.rint((values[:, :2] @ direction) / cell_m).astype(np.int64)
@@ -214,19 +221,19 @@ def _moments_across(
     mean = w @ values
     cov = (values - mean).T @ (w[:, None] * (values - mean))
     ridge = cov[:, :2] @ direction
-    ridge /= ridge[:2] @ direction  # its heading may turn along it
+    ridge /= ridge[:2] @ direction  # with the heading, which may change along the ridge
     return mean, cov + _UNTOLD_M**2 * np.outer(ridge, ridge)
 
 
 def _cut_off(spot: NDArray[np.int64], cells: tuple[NDArray[np.int64], ...], shape: tuple[int, ...]) -> bool:
-    """Return whether a peak is only a slope towards a maximum outside: it is at a face of the window, and narrow there."""
+    """Return whether a peak is only the slope of a maximum outside: it is at the border of the window, and narrow."""
     return any(at in (0, n - 1) and np.ptp(axis) < _NARROW for at, axis, n in zip(spot, cells, shape, strict=True))
 
 
 def _moments(
     log_likelihood: NDArray[np.float32], part: tuple[NDArray[np.int64], ...], mass: Array, grid: SearchGrid
 ) -> tuple[Array, Array]:
-    """Return mean (3,) and covariance (3, 3) of a part of the posterior; along narrow axes interpolated between cells."""
+    """Return mean (3,) and covariance (3, 3) of a part of the posterior, interpolated along axes with few cells."""
     low, high = (np.array([f(axis) for axis in part]) for f in (np.min, np.max))
     narrow = high - low < _NARROW
     cells = np.stack(part).astype(float)
@@ -234,7 +241,7 @@ def _moments(
     if narrow.any():
         low, high = np.maximum(low - narrow, 0), np.minimum(high + narrow, np.array(mass.shape) - 1)
         box = log_likelihood[tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))]
-        finer = _FINER if narrow.all() else _FINER - 2  # a long one has cells enough
+        finer = _FINER if narrow.all() else _FINER - 2  # a long part has cells enough
         steps = [
             np.linspace(0.0, n - 1.0, (n - 1) * (finer if k else 1) + 1) for n, k in zip(box.shape, narrow, strict=True)
         ]

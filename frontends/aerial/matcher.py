@@ -18,17 +18,18 @@ from graphloc.frontends.aerial.match import Mode, SearchGrid, grid_around, log_l
 from graphloc.frontends.aerial.scan import LevelCloud, Outline, outline
 from graphloc.measurements import PoseFix, PoseMode
 
-_NONE_LOG = 5.0  # the best pose of pure chance is about that much over the mean
-_CONTRAST = (-3.46, 0.096)  # log-odds of windows with the truth to those without, by tune_matcher.py as well
-_MOST_WITHIN = 0.95  # priors may be wrong, however sure
+_NONE_LOG = 5.0  # log-likelihood of the best pose by pure chance, over the mean
+# Log-odds that the truth is in a window: constant, and factor of the contrast; by tune_matcher.py.
+_CONTRAST = (-3.46, 0.096)
+_MOST_WITHIN = 0.95  # largest prior probability that the truth is in the window: priors may be wrong
 _LEAST_PLACES = 30
 _MODES = 5
-# How long inertial sensors carry a place, and a heading, to a match's accuracy, and to which. Less accurate ones they carry for longer:
-# a place is lost with the square of time, a heading linearly.
+# Times for which inertial sensors carry a position, and a heading, to an accuracy. To a worse accuracy they carry them
+# for longer: errors of position grow with the square of time, those of heading linearly.
 _CARRIED_S, _CARRIED_M = 5.0, 0.1
 _CARRIED_YAW_S, _CARRIED_YAW_RAD = 60.0, np.radians(0.5)
-_SAME_RAD = np.radians(2.0)  # headings that are as near are the same
-_LEAST_NEWS = 1e-6  # of a match at the same place and time: next to nothing, but its covariance stays finite
+_SAME_RAD = np.radians(2.0)  # headings of modes that differ by less are equal
+_LEAST_NEWS = 1e-6  # least independent share of a match at the place and time of the last one: keeps it finite
 NO_POSE = "no pose in the window stands out"
 """Why a scan has no match: it fits nowhere better than by chance."""
 
@@ -43,13 +44,14 @@ class Prior:
 
 @dataclass(frozen=True, slots=True)
 class Since:
-    """How far, and how long, a match is from the one before it.
+    """Distance and time from the match before to a match.
 
-    Their errors, and which mode looks right, are a first-order Markov process along the path, r = exp(-way): the same walls, the same
-    boats. What a match adds to a mean of such ones is (1 - r) / (1 + r).
+    Errors of matches, and which mode looks right, are a first-order Markov process along the path, with the correlation
+    r = exp(-way) between two matches: they see nearly the same walls and boats. The independent share of a match is
+    (1 - r) / (1 + r).
 
     Attributes:
-        way: distance travelled, in lengths of correlation (`AerialConfig.alike_m`). waited_s: time.
+        way: distance travelled, in correlation lengths (`AerialConfig.alike_m`). waited_s: time.
     """
 
     way: float
@@ -57,11 +59,14 @@ class Since:
 
     @property
     def news(self) -> float:
-        """Share of the evidence for right or false that is independent of the match before."""
+        """Share of the evidence for right or false modes that is independent of the match before."""
         return float(np.tanh(0.5 * self.way))
 
     def widened(self, cov: Array) -> Array:
-        """Return the covariance (3, 3) of what is independent of the match before, where inertial sensors have not forgotten it."""
+        """Return the covariance (3, 3) of the part of a match that is independent of the one before.
+
+        Where inertial sensors have lost the match before, all of the match is independent.
+        """
         variances, axes = np.linalg.eigh(cov[:2, :2])
         carried_s = _CARRIED_S * np.maximum(np.sqrt(variances) / _CARRIED_M, 1.0) ** 0.5
         yaw_s = _CARRIED_YAW_S * max(float(np.sqrt(cov[2, 2])) / _CARRIED_YAW_RAD, 1.0)
@@ -78,8 +83,8 @@ class Match:
     """Result of a match.
 
     Attributes:
-        prior: the prediction. found: the scan's outline. layers: of the map. grid, score: log-likelihood (H, R, C) over the
-            grid. modes: best first. none: probability that no mode is right.
+        prior: the prediction. found: the scan's outline. layers: of the map. grid, score: candidate poses, and their
+            log-likelihood (H, R, C). modes: best first. none: probability that no mode is right.
         why_not: why there is no mode; empty if there is one.
         cut_off: whether the window was too small for 2 sigma of the prior.
     """
@@ -96,13 +101,13 @@ class Match:
 
     @property
     def distance_m(self) -> float:
-        """Median distance to what was matched, m; 0 where the matcher does not say."""
+        """Median distance to what was matched, m; 0 if the matcher does not tell it."""
         places_m = np.vstack([self.found.faces_m, self.found.shore_m])
         return float(np.median(np.hypot(*places_m.T))) if len(places_m) else 0.0
 
     @property
     def of_heading(self) -> float:
-        """Probability of the best mode's heading, wherever the vessel is: a row of boats moves the place, not the heading."""
+        """Probability of the best mode's heading, at any position: a row of boats makes only the position ambiguous."""
         alike = (m for m in self.modes if abs(float(wrap_angle(m.pose[2] - self.modes[0].pose[2]))) < _SAME_RAD)
         return sum(m.probability for m in alike)
 
@@ -112,10 +117,11 @@ class Match:
         """Return the modes as one measurement.
 
         Args:
-            since: the match before, whose errors it shares in part; None: there is none. axes: to be used.
+            stamp_ns, sensor: of the measurement. axes: to be used.
+            since: distance and time from the match before, whose errors it shares in part; None: there is none.
         """
         news = 1.0 if since is None else since.news
-        # Which of its modes is right is no news if the match before saw the same.
+        # Which mode is right is no news if the match before saw the same boats.
         told = np.array([m.probability for m in self.modes])
         share = told**news
         picked = [k for k, a in enumerate(("x", "y", "yaw")) if a in axes]
@@ -132,15 +138,15 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """How far the posterior of a scan is to be believed, by runs through drawn harbours (`benchmarks/tune_odds.py`).
+    """How far the posterior of a scan is believed, fitted to runs through drawn harbours (`benchmarks/tune_odds.py`).
 
-    What the likelihood does not know: boats at other berths than on the image, a tide, a track that is not quite right. So a scan of
-    little evidence fits best at a false place as often as not, and modes are less decided than they look.
+    The likelihood does not know boats at other berths than on the image, a tide, or errors of the track. So a scan with
+    little evidence fits best at a false place as often as not, and the odds between modes are less clear than computed.
 
     Attributes:
-        enough, power: the odds that one of the modes is right if the truth is in the window are (N / enough)^power, with the evidence N
-            of the scan, or that of all n turns / n^alike where this is more: they show the same walls. decided: exponent of the odds
-            between modes.
+        enough, power: the odds that one of the modes is right, if the truth is in the window, are (N / enough)^power.
+            N is the evidence of the scan or, if it is more, that of all n turns divided by n^alike.
+        alike: see above; turns show the same walls. decided: exponent of the odds between modes.
     """
 
     enough: float = 15.0
@@ -155,7 +161,7 @@ class Belief:
         return float(special.expit(self.power * np.log(evidence / self.enough)))
 
     def less_decided(self, modes: Sequence[Mode], share: float = 1.0) -> list[Mode]:
-        """Return modes whose odds are closer to even, with a share of their sum."""
+        """Return the modes with odds closer to even, and the sum of their probabilities multiplied by `share`."""
         if not modes:
             return []
         told = np.array([m.probability for m in modes])
@@ -198,7 +204,7 @@ class Matcher:
         score = log_likelihood_of(found, layers, grid)
         trust = _trust(score, _within(prior.sigma, np.array([half_m, half_m, np.radians(half_deg)])))
         modes, _ = modes_of(score, grid, _NONE_LOG, 1.0 - trust, _MODES, found.normals)
-        modes = BELIEF.less_decided(modes, BELIEF.share(found))  # which modes there are does not turn on it
+        modes = BELIEF.less_decided(modes, BELIEF.share(found))  # changes probabilities only, not which modes there are
         none = 1.0 - sum(m.probability for m in modes)
         why_not = "" if modes else NO_POSE
         cut_off = half_m < 2.0 * sigma_m or half_deg < 2.0 * sigma_deg
@@ -208,14 +214,14 @@ class Matcher:
 def _trust(score: Layer, within: float) -> float:
     """Return the probability that the truth is in the window, given the score.
 
-    Windows without the truth have peaks too, of things that look alike; they rise less above the mean.
+    Windows without the truth have peaks, too, where the map looks alike; they rise less above the mean.
     """
     contrast = float(score.max()) - float(score.mean())
     return float(special.expit(_CONTRAST[0] + _CONTRAST[1] * contrast + special.logit(min(within, _MOST_WITHIN))))
 
 
 def _within(sigma: Array, half: Array) -> float:
-    """Return the probability that the truth is in the window, by the prior's sigmas (3,)."""
+    """Return the probability that the truth is in a window of half sizes `half` (3,), by the prior's sigmas (3,)."""
     return float(np.prod(special.erf(half / (np.sqrt(2.0) * np.maximum(sigma, 1e-9)))))
 
 

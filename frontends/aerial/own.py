@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points that stay with the vessel from scan to scan: she herself, where `hull_m` does not hold her. Points under the water.
+"""Warnings on points that stay with the vessel from scan to scan, and on points under the water.
 
-The former are the first returns in their direction, so that a match hides behind them: without `hull_m` no scan of a launch with a LiDAR
-on its mast matched, and the reason given was that no pose stands out.
+Points that stay are of the vessel herself, where `hull_m` does not contain her. They are the first returns in their
+direction, and hide what could be matched: without `hull_m` no scan of a launch with a LiDAR on its mast matched, and
+the reason given was that no pose stands out.
 """
 
 from __future__ import annotations
@@ -18,23 +19,26 @@ from graphloc.frames import Array
 from graphloc.frontends.aerial.scan import Outline
 
 _CELL_M = 0.5
-_AWAY_M = 25.0  # half a large vessel
+_AWAY_M = 25.0  # points farther from the origin of body are not counted: half the length of a large vessel
 _FEWEST_SCANS = 10
-_MOVED_M = 20.0  # until then what stands still may seem to stay
-_STAYS = 0.8  # of the scans; of a launch 39 of 70 cells, others at most 0.7
-# To a LiDAR, or a corner of the hull: she begins there; a quay that she goes along stays as well, farther off.
+_MOVED_M = 20.0  # before the vessel has moved so far, what stands still seems to stay with her
+# Least share of the scans in which a cell that stays has a point: of a launch 39 of 70 cells, all others 0.7 at most.
+_STAYS = 0.8
+# Largest distance of the vessel's nearest cell to a LiDAR or a corner of the hull; a quay that she goes along stays as
+# well, but is farther off.
 _CLOSE_M = 3.0
 _GAP_M = 1.5
-_WALL = "a wall that she went along all the time"  # of a lock or canal, nearer than what is told from her
+_WALL = "a wall that she went along all the time"  # of a lock or canal, if it is that close
 _FEWEST_CELLS = 8
-_UNDER_M = 1.0  # nothing is hit there; waves, a tilt and the mirror images of walls in calm water aside
+_UNDER_M = 1.0  # nothing so deep is hit, apart from waves, tilts and mirror images of walls in calm water
 
 
 class Staying:
     """Counts in how many scans each place of the vessel's surroundings holds a point above the water.
 
     Args:
-        hull_m: corners [forward, port] of the hull in body, m; may be empty. lidars_m: (t (3,) m) of the LiDARs in body.
+        hull_m: corners [forward, port] of the hull in body, m; may be empty. lidars_m: (t (3,) m) of the LiDARs in
+            body.
     """
 
     def __init__(self, hull_m: Sequence[tuple[float, float]], lidars_m: Iterable[Array]) -> None:
@@ -45,14 +49,14 @@ class Staying:
         self._lowest_m: list[float] = []
 
     def take(self, found: Outline, place_m: Array) -> None:
-        """Count a scan's points outside the hull; `place_m` (2,) of the vessel in world."""
+        """Count a scan's points outside the hull; `place_m`: (2,) position of the vessel in world."""
         near = found.columns_m[np.hypot(*found.columns_m.T) < _AWAY_M]
         self._held.update({(int(x), int(y)) for x, y in np.unique(np.floor(near / _CELL_M), axis=0)})
         self._places.append(place_m)
         self._lowest_m += [found.lowest_m] if np.isfinite(found.lowest_m) else []
 
     def said(self) -> list[str]:
-        """Return lines on points under the water, and on those that stay with the vessel."""
+        """Return warnings on points under the water, and on points that stay with the vessel."""
         return [*self._under_water(), *self._staying()]
 
     def _under_water(self) -> list[str]:
@@ -63,7 +67,7 @@ class Staying:
         return [f"points lie {-lowest_m:.1f} m under the water and deeper: {wrong}"]
 
     def _staying(self) -> list[str]:
-        """Return a line that names the rectangle which stays with the vessel, if there is one: what her LiDARs see of her."""
+        """Return a warning that names the rectangle of points that stay with the vessel, if there are such points."""
         scans = len(self._places)
         if scans < _FEWEST_SCANS or np.ptp(self._places, axis=0).max() < _MOVED_M:
             return []
@@ -82,7 +86,7 @@ class Staying:
         return [f"{seen} outside hull_m stay with the vessel, within {box}: herself, {water}, or {_WALL}"]
 
     def _hanging_together(self, cells_m: Array) -> Array:
-        """Return the cells (N, 2) that hang together with some close to what is known of the vessel."""
+        """Return the cells (N, 2) that are connected with cells close to a LiDAR or a corner of the hull."""
         if not len(cells_m):
             return cells_m
         tree = cKDTree(cells_m)

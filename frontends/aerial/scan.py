@@ -17,13 +17,13 @@ from scipy.spatial import cKDTree
 from graphloc.frames import Array
 
 _CELL_M = 0.25
-_DRY_M = 0.3  # BL: what is lower is water
-_BOAT_M = 2.0  # boats end there, or a metre above
-_SHORE_M = 2.5  # below that height, returns are of what bounds the water
-_NEAR_M = 1.25  # neighbours that make a line
+_DRY_M = 0.3  # lower points are water (BL)
+_BOAT_M = 2.0  # boats are so high, or up to a metre higher
+_SHORE_M = 2.5  # lower returns are of what bounds the water
+_NEAR_M = 1.25  # largest distance of neighbours on a line
 _SAME_LINE_RAD, _SAME_LINE_M = np.radians(15.0), 0.3
 _SECTORS = 360
-_NO_LINE = 0.6  # weight of a place on a line of fewer than three
+_NO_LINE = 0.6  # points with a larger weight are on a line of fewer than three points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,8 +31,9 @@ class LevelCloud:
     """Points of one or more scans in `level`.
 
     Attributes:
-        points_m: (N, 3). origin_m: (N, 2) origin of the ray of each. now: how many of them, the first ones, are of the scan itself and
-            not of others beside it; None: all. turns: of how many places it is, seen from apart.
+        points_m: (N, 3). origin_m: (N, 2) origin of the ray to each point.
+        now: number of points, the first ones, that are of the scan itself and not of other turns; None: all.
+        turns: number of turns, seen from different positions.
     """
 
     points_m: Array
@@ -46,14 +47,16 @@ class Outline:
     """Features of a scan for the matcher.
 
     Attributes:
-        faces_m: (M, 2) cells of faces. line_rad: (M,) direction of the line through each. tall: (M,) 1 if higher than a boat,
-            else 0. face_share: (M,) weight of each. shore_m: (K, 2) first objects behind water. to_land_rad: (K,) direction
-            away from the sensor. shore_share: (K,) weight of each. water_m: (L, 2) points seen as free water.
-        columns_m: (J, 2) where anything rises out of the water in the scan itself. lowest_m: height over the waterline below which
-            a twentieth of its points lies; NaN of none.
-        turns: of how many places it is, seen from apart. own: outline of the scan itself; None: this is it.
-        normals: (2, 2) mean of n n^T by weight over the normals n of the lines through faces and first returns, in `level`, trace 1:
-            d^T normals d is the share of the lines that say where along a direction d the scan is. Without a line a place says so both ways.
+        faces_m: (M, 2) cells of vertical faces. line_rad: (M,) direction of the line through each. tall: (M,) from 0 of
+            a face as high as a boat to 1 of one a metre higher. face_share: (M,) weight of each.
+        shore_m: (K, 2) first returns: nearest objects behind water. to_land_rad: (K,) direction away from the sensor.
+        shore_share: (K,) weight of each. water_m: (L, 2) points seen as free water.
+        columns_m: (J, 2) where anything rises out of the water in the scan itself. lowest_m: height over the waterline
+            below which a twentieth of its points lies; NaN without points.
+        turns: number of turns, seen from different positions. own: outline of the scan itself; None: this is it.
+        normals: (2, 2) weighted mean of n n^T, trace 1, over the normals n of the lines through faces and first
+            returns, in `level`: d^T normals d is the share of the lines that tell the position along a direction d. A
+            point without a line tells it in both directions alike.
     """
 
     faces_m: Array
@@ -72,24 +75,27 @@ class Outline:
 
     @property
     def evidence(self) -> float:
-        """Number of faces and first returns, if they were independent of each other."""
+        """Equivalent number of independent faces and first returns."""
         return float(self.face_share.sum() + self.shore_share.sum())
 
 
 def outline(cloud: LevelCloud, hull: NDArray[np.float64] | None, reach_m: float = 100.0) -> Outline:
-    """Return the outline of a cloud; points within `hull` (K, 2) in body, a closed polygon, are the vessel itself."""
+    """Return the outline of a cloud, up to a distance `reach_m`.
+
+    Points within `hull` (K, 2), a closed polygon in body, are of the vessel itself, and left out.
+    """
     p, away = cloud.points_m, np.hypot(*cloud.points_m[:, :2].T)
-    keep = (away < reach_m) & np.isfinite(p[:, 2])  # of no number is less than the reach
+    keep = (away < reach_m) & np.isfinite(p[:, 2])  # a distance of NaN fails the comparison
     if hull is not None:
         keep &= ~inside(hull, p[:, :2])
     now = np.arange(len(p)) < (len(p) if cloud.now is None else cloud.now)
-    keep &= (keep & now).any()  # without a point of its own a scan tells nothing new
+    keep &= (keep & now).any()  # a scan without points of its own tells nothing new
     chosen = np.flatnonzero(keep)
     now, p, origin = now[chosen], p.take(chosen, axis=0), cloud.origin_m.take(chosen, axis=0)
     own = None if now.all() else outline(LevelCloud(p[now], origin[now]), None, reach_m)
     dry = p[:, 2] > _DRY_M
     cells, low, high, count = _columns(p[dry])
-    # A face is hit at several heights; a roof or a quay's deck, seen at a grazing angle, is not.
+    # A vertical face is hit at several heights; a roof or a quay's deck, seen at a grazing angle, is not.
     face = (high - low > 0.25) & (count >= 3)
     at = cells[face]
     direction, share = _lines(at, _NEAR_M)
@@ -116,7 +122,7 @@ def inside(polygon: NDArray[np.float64], points_m: Array) -> NDArray[np.bool_]:
     """Return which points (N, 2) are within a polygon (K, 2)."""
     (west, south), (east, north) = polygon.min(axis=0), polygon.max(axis=0)
     u, v = points_m[:, 0], points_m[:, 1]
-    within = (u >= west) & (u <= east) & (v >= south) & (v <= north)  # most are not
+    within = (u >= west) & (u <= east) & (v >= south) & (v <= north)  # excludes most points
     a, b = polygon, np.roll(polygon, -1, axis=0)
     x, y = u[within, None], v[within, None]
     spans = (a[:, 1] > y) != (b[:, 1] > y)
@@ -127,7 +133,7 @@ def inside(polygon: NDArray[np.float64], points_m: Array) -> NDArray[np.bool_]:
 
 
 def _columns(p: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Stack points into columns: mean position (M, 2), lowest and highest (M,), count (M,)."""
+    """Return points (N, 3) as columns over cells: mean position (M, 2), lowest and highest z (M,), count (M,)."""
     if not len(p):
         return np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64)
     column, row = np.floor(p[:, :2].T / _CELL_M).astype(np.int64)
@@ -142,10 +148,10 @@ def _columns(p: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
 
 
 def _lines(at: Array, near_m: float) -> tuple[Array, Array]:
-    """Return the direction (M,) of the line through each point and its neighbours, and the weight of each point (M,).
+    """Return the direction (M,), rad, of the line through each point (M, 2) and its neighbours, and its weight (M,).
 
-    The weight is 1 / sqrt(number of points on its line): points of one wall are right or wrong together, so a wall of a hundred tells
-    more than a boat's side of nine, but not eleven times as much.
+    The weight is 1 / sqrt(number of points on the line): points of one wall are right or wrong together, so a wall of a
+    hundred points tells more than a boat's side of nine, but not eleven times as much.
     """
     if len(at) < 2:
         return np.zeros(len(at)), np.ones(len(at))
@@ -163,7 +169,7 @@ def _lines(at: Array, near_m: float) -> tuple[Array, Array]:
 
 
 def _normals(line_rad: Array, share: Array) -> Array:
-    """Return `Outline.normals` of places (N,), by the direction of their lines and their weights."""
+    """Return `Outline.normals` of points, by the directions of their lines (N,) and their weights (N,)."""
     if not len(share):
         return 0.5 * np.eye(2)
     x, y = np.where(share > _NO_LINE, np.sqrt(0.5), [-np.sin(line_rad), np.cos(line_rad)])
@@ -172,7 +178,7 @@ def _normals(line_rad: Array, share: Array) -> Array:
 
 
 def _first_returns(p: Array, origin: Array) -> tuple[Array, Array]:
-    """Return the nearest object in each direction that rises out of the water, and the direction (rad)."""
+    """Return the nearest point (K, 2) of each sector that rises out of the water, and its ray's direction (K,), rad."""
     near = np.flatnonzero(p[:, 2] < _SHORE_M)
     d = p.take(near, axis=0)[:, :2]
     away, angle = np.hypot(*d.T), np.arctan2(d[:, 1], d[:, 0])
@@ -186,6 +192,6 @@ def _first_returns(p: Array, origin: Array) -> tuple[Array, Array]:
 
 
 def _free_water(shore: Array, wet: Array) -> Array:
-    """Return points of water: returns from it, and points between the vessel and the first object."""
+    """Return points (L, 2) of water: returns from it, and points between the vessel and the first objects."""
     between = [shore * s for s in (0.3, 0.5, 0.7)]
     return np.vstack([wet[:, :2], *[b[np.hypot(*b.T) > 8.0] for b in between]])

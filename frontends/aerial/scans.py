@@ -26,7 +26,7 @@ from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
-_TURN_S = 0.5  # scans of several LiDARs farther apart than this are not one
+_TURN_S = 0.5  # scans of several LiDARs that are farther apart in time are not one turn
 
 
 class ScanFeed:
@@ -61,8 +61,10 @@ def match_bag(
     """Match the scans of a bag around a track, at the configured interval, or only the one nearest to `at_ns`.
 
     Args:
-        folder: base of relative paths of maps. warn: is called with each damage of the bag, and of points that stay with the
-            vessel.
+        bags: see `read_recording`. config: of the aerial sensor. folder: base of relative paths of maps.
+        body_frame: in tf. track: of the body. datum: origin of world.
+        at_ns: match the scan nearest to this stamp only. warn: called with each damage of the bag, and with warnings on
+            points that stay with the vessel.
 
     Raises:
         InputError: no LiDAR, a missing topic, a mount without a chain of transforms, or an unusable map.
@@ -92,10 +94,11 @@ def match_bag(
 def _shown_ahead(
     feed: Iterable[Turn], matcher: LiveMatcher, track: Trajectory, config: AerialConfig, *, due_alone: bool
 ) -> Iterator[Turn]:
-    """Show each turn to a matcher, and yield it once those of the time after it have been shown, too.
+    """Show each turn to a matcher, and yield it once the turns of the time after it have been shown, too.
 
     Args:
-        due_alone: turns that are not due are not yielded, unless they may be parts of one that is: full scans take much memory.
+        due_alone: turns that are not due are not yielded, unless they may be parts of one that is due: full scans take
+            much memory.
     """
     waiting, ahead_ns, pace = deque[Turn](), round(config.around_s * NS_PER_S), Pace(config)
     newest_ns: int | None = None
@@ -139,9 +142,9 @@ def _mounts(bag: Bag, config: AerialConfig, body_frame: str) -> dict[str, tuple[
 
 
 def _turns(bag: Bag, config: AerialConfig) -> Iterator[Turn]:
-    """Group scans: the newest of each LiDAR, once there is one of each within `_TURN_S`.
+    """Yield turns: the newest scan of each LiDAR, once there is one of each within `_TURN_S`.
 
-    If one is missing, or is slower than that, the others form a turn without it.
+    If a LiDAR is missing, or slower than that, the others form a turn without it.
     """
     names = {lidar.topic: name for name, lidar in config.lidars.items()}
     frames: dict[str, str] = {}
@@ -178,10 +181,15 @@ def _turns(bag: Bag, config: AerialConfig) -> Iterator[Turn]:
 
 
 def _refuse_another(frames: dict[str, str], lidar: str, msg: Any, mounted: str | None) -> None:
-    """Refuse a scan of another LiDAR on the topic: one mount places all of a topic.
+    """Refuse a scan of another LiDAR on a topic, since one mount places all scans of a topic.
 
     Args:
-        frames: by LiDAR, the frame of its scans: the first that one of them names, or that of its mount (`mounted`) once one does.
+        msg: the scan. lidar: its name. mounted: frame of the LiDAR's mount.
+        frames: by LiDAR, the frame of its scans, updated in place: the first one that a scan names, or `mounted` once a
+            scan names that.
+
+    Raises:
+        ValueError: the scan names another frame.
     """
     frame = str(getattr(getattr(msg, "header", None), "frame_id", "")).lstrip("/")
     own = frames[lidar] = frame if frame and frame == mounted else frames.get(lidar) or frame

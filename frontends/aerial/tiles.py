@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A folder of Web Mercator tiles as one image, by GDAL's tile reader.
 
-GDAL reads the tiles that a window needs, treats a missing file as no data, and converts grey, palette, RGB and RGBA tiles to
-RGBA (driver WMS, service TMS, docs: gdal.org/drivers/raster/wms.html). It does not access the network.
+GDAL reads the tiles that a window needs, treats a missing file as no data, and converts grey, palette, RGB and RGBA
+tiles to RGBA (driver WMS, service TMS, docs: gdal.org/drivers/raster/wms.html). It does not access the network.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ _WANTED = "a folder of tiles has z/x/y.png (or jpg, jpeg, webp), Web Mercator, a
 def describe_tiles(folder: Path, datum: Datum) -> str:
     """Return GDAL's description (XML, to be opened like a file) of a folder of tiles z/x/y.png, jpg, webp.
 
-    The image is the deepest zoom level (22 at most); the levels above it without a gap are its overviews. Rows count from the top
-    (XYZ) or from below (TMS): whichever places the tiles nearer to the datum, XYZ if equal (which takes a datum within a tile or so
-    of the equator, or tiles of both hemispheres).
+    The image is the deepest zoom level (22 at most); the levels above it, up to a gap, are its overviews. Rows count
+    from the top (XYZ) or from below (TMS): whichever places the tiles nearer to the datum. If both are equal, which
+    takes a datum within about a tile of the equator or tiles of both hemispheres, XYZ.
 
     Raises:
-        InputError: no such tiles, a part of such a folder, several kinds of files, a folder that cannot be listed, or tiles more
-            than 100 km from the datum either way.
+        InputError: no such tiles, a part of such a folder, several kinds of files, a folder that cannot be listed, or
+            tiles more than 100 km from the datum by XYZ and by TMS.
     """
     try:
         return _described(folder, datum)
@@ -55,7 +55,7 @@ def _described(folder: Path, datum: Datum) -> str:
     across, down = _tile_of(datum, zoom)
 
     def columns_off(x: int) -> float:
-        return abs((x + 0.5 - across + 0.5 * n) % n - 0.5 * n)  # the last one is beside the first
+        return abs((x + 0.5 - across + 0.5 * n) % n - 0.5 * n)  # the last column is beside the first
 
     column = min(columns, key=columns_off)
     found = _tiles(columns[column])
@@ -90,7 +90,7 @@ def _xml(folder: Path, tile: Path, zoom: int, overviews: int, rows_from: str) ->
                 width, height = opened.width, opened.height
     except rasterio.errors.RasterioError as error:
         raise InputError(f"{tile}: not an image that GDAL can read ({error})") from None
-    # as_uri: GDAL wants blanks and such quoted. 404: no file. 200: a file without content, which some tools write.
+    # as_uri: GDAL wants blanks etc. quoted. 404: no file. 200: an empty file, which some tools write.
     return (
         f'<GDAL_WMS><Service name="TMS"><ServerUrl>{folder.resolve().as_uri()}/${{z}}/${{x}}/${{y}}{tile.suffix}</ServerUrl>'
         f"</Service><DataWindow><UpperLeftX>{-_HALF_M!r}</UpperLeftX><UpperLeftY>{_HALF_M!r}</UpperLeftY>"
@@ -103,7 +103,7 @@ def _xml(folder: Path, tile: Path, zoom: int, overviews: int, rows_from: str) ->
 
 
 def _folders(folder: Path) -> dict[int, Path]:
-    """Return the folders named by a number as GDAL writes it (16, not 016)."""
+    """Return the subfolders named by a number as GDAL writes it (16, not 016), by number."""
     return {int(p.name): p for p in folder.iterdir() if _NUMBER.fullmatch(p.name) and p.is_dir()}
 
 

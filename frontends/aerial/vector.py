@@ -11,9 +11,9 @@ The side of a line on which land is comes from the tags of features (keys as in 
 - a line `natural` = coastline: land is on its left;
 - any other: unknown. Its lines are edges, not shores.
 
-Tags that ogr2ogr packs into one text (`other_tags`) are not read. RFC 7946 requires counter-clockwise outer rings, but files
-often differ: the inside of a ring is computed. A common border of two polygons with land on opposite sides (water in two parts,
-a terrace of houses) is no shore and nothing visible: it is left out.
+Tags that ogr2ogr packs into one text (`other_tags`) are not read. RFC 7946 requires counter-clockwise outer rings, but
+files often differ, so the inside of a ring is computed. A common border of two polygons with land on opposite sides
+(water in two parts, a terrace of houses) is no shore, and not visible: it is left out.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class VectorMap:
 class _Line(NamedTuple):
     """A line of a file: positions (P, 2), x and y as written, P > 1; side of land: 1 left, -1 right, 0 unknown.
 
-    Of a ring, the side is that of its counter-clockwise direction.
+    The side of a ring refers to its counter-clockwise direction.
     """
 
     xy: Array
@@ -95,12 +95,13 @@ class _Found:
 def read_vector(path: Path, datum: Datum) -> VectorMap:
     """Read a GeoJSON file (RFC 7946: longitude, latitude on WGS 84; heights are not used).
 
-    A `crs` member of older GeoJSON is honoured, with x, y as east, north, as GDAL writes them. Lines that are straight in the file
-    are taken as straight in world: 500 m east at 57 deg north bend by less than 1 cm. Segments longer than 50 km, which bend by 70 m,
-    and those beyond 1000 km from the datum are omitted. Longitudes may run from -180 or to 360.
+    A `crs` member of older GeoJSON is honoured, with x, y as east, north, as GDAL writes them. Lines that are straight
+    in the file are taken as straight in world: 500 m east at 57 deg north bend by less than 1 cm. Segments longer than
+    50 km, which bend by 70 m, and segments beyond 1000 km from the datum are omitted. Longitudes may be from -180 to
+    360.
 
     Raises:
-        InputError: it cannot be read, is not GeoJSON, has no line, or is farther than 50 km from the datum.
+        InputError: the file cannot be read, is not GeoJSON, has no line, or is farther than 50 km from the datum.
     """
     try:
         document = _document(path)
@@ -165,7 +166,7 @@ def _tags_of(feature: Mapping[str, Any]) -> Mapping[str, str]:
 
 
 def _gather(found: _Found, tags: Mapping[str, str], geometry: Any) -> None:
-    """Append the lines of a geometry; null has none."""
+    """Append the lines of a geometry to `found`; a null geometry has none."""
     if geometry is None:
         return
     kind = geometry.get("type") if isinstance(geometry, dict) else geometry
@@ -217,7 +218,7 @@ def _positions(line: Any) -> Array:
 
 
 def _land_of(tags: Mapping[str, str], polygon: bool) -> int:
-    """Return the side of land: 1 on the left, or inside a polygon, -1 opposite, 0 unknown."""
+    """Return the side of land: 1 on the left of a line or inside a polygon, -1 on the other side, 0 unknown."""
     drawn = tags.get("graphloc")
     if drawn is not None and drawn not in ("land", "water"):
         raise ValueError(f"the property `graphloc` is {drawn[:40]!r}: water or land")
@@ -254,7 +255,7 @@ def _in_world(xy: Array, crs: CRS | None, datum: Datum) -> tuple[Array, Array]:
         longitude, latitude = (x, y) if to_wgs84 is None else to_wgs84.transform(x, y)
         if not ((np.abs(longitude) <= 360.0) & (np.abs(latitude) <= 90.0)).all():
             return None
-        # In (-180, 180], so that both sides of the date line are the same to the last bit.
+        # To (-180, 180], so that -180 and 180 are equal to the last bit.
         longitude = np.where(longitude > 180.0, longitude - 360.0, longitude)
         longitude = np.where(longitude <= -180.0, longitude + 360.0, longitude)
         east = (longitude - datum.origin.longitude_deg + 180.0) % 360.0 - 180.0
@@ -276,13 +277,13 @@ def _in_world(xy: Array, crs: CRS | None, datum: Datum) -> tuple[Array, Array]:
 
 
 def _segments(found: _Found, p_m: Array, degrees: Array) -> VectorMap:
-    """Return the segments of lines through points (N, 3) in world, which are degrees (N, 2) east, north of the datum."""
+    """Return the segments of lines through points, (N, 3) in world and (N, 2) in degrees east, north of the datum."""
     lengths = [len(line.xy) for line in found.lines]
     line = np.repeat(np.arange(len(lengths)), lengths)
     of = line[1:][line[1:] == line[:-1]]
     within = line[1:] == line[:-1]
-    # Twice the area to the left of a ring, from its first point, which keeps the digits; in degrees, as a plane that
-    # touches the Earth shows what is beyond the horizon mirrored.
+    # Twice the signed area of a ring, positive if counter-clockwise, about its first point, which saves digits. It is
+    # in degrees, since the tangent plane mirrors what is beyond the horizon.
     since = degrees[:-1][within] - degrees[np.cumsum([0, *lengths[:-1]])[of]]
     turn = np.diff(degrees, axis=0)[within]
     area = np.bincount(of, since[:, 0] * turn[:, 1] - since[:, 1] * turn[:, 0], len(lengths))
@@ -304,7 +305,7 @@ def _segments(found: _Found, p_m: Array, degrees: Array) -> VectorMap:
 
 
 def _contradicted(ends: Array, left: Array) -> NDArray[np.bool_]:
-    """Return which segments (S, 2, 2) occur again with land on the other side; `left` (S,) is 1, -1 or 0."""
+    """Return (S,) which segments (S, 2, 2) occur again with land on the other side; `left` (S,): side, 1, -1 or 0."""
     back = (ends[:, 0, 0] > ends[:, 1, 0]) | ((ends[:, 0, 0] == ends[:, 1, 0]) & (ends[:, 0, 1] > ends[:, 1, 1]))
     forth = np.where(back[:, None, None], ends[:, ::-1], ends).reshape(-1, 4)
     same = np.unique(forth, axis=0, return_inverse=True)[1].ravel()

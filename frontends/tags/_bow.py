@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Undistorted image that touches a camera's image at a point; sides of tags are straight in it."""
+"""An undistorted image, tangent to a camera's image at a point, in which the sides of tags are straight."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from graphloc.frontends.tags.camera import CameraModel
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unbowed:
-    """A pinhole image tangent to the lens's image at a point: the same there, to first order.
+    """A pinhole image that equals the lens's image near a point, the middle, to first order.
 
-    Its points, flat = middle + J (ray - ray of the middle), differ by fractions of a pixel from those of the image near the
-    middle, at the same sharpness. J is the lens's d px / d ray at the middle.
+    Its points are flat = middle + J (ray - ray of the middle), where J is the lens's d px / d ray at the middle. Near
+    the middle they differ from points of the lens's image by fractions of a pixel, and the sharpness is the same.
 
     Attributes:
-        middle_px: (2,) of the image. ray: (1, 2) there. J_px: (2, 2).
+        lens: camera and lens. middle_px: (2,) the middle. ray: (1, 2) its ray. J_px: (2, 2) J.
     """
 
     lens: CameraModel
@@ -28,11 +28,11 @@ class Unbowed:
     J_px: Array
 
     def flat(self, px: Array) -> Array:
-        """Return undistorted points (N, 2), px, of points of the image; NaN where no ray leads to them."""
+        """Return the undistorted points (N, 2), px, of points of the camera's image; NaN where these have no ray."""
         return np.asarray(self.middle_px + (self.lens.rays(px) - self.ray) @ self.J_px.T)
 
     def bowed(self, flat_px: Array) -> Array:
-        """Return points (N, 2), px, of the image at undistorted ones; NaN where the lens has none."""
+        """Return the points (N, 2), px, of the camera's image, of undistorted points; NaN where the lens has none."""
         return self.lens.project(self._rays(flat_px))
 
     def slope(self, flat_px: Array) -> Array:
@@ -44,7 +44,7 @@ class Unbowed:
 
 
 def unbowed(lens: CameraModel | None, corners_px: Array) -> Unbowed | None:
-    """Return the undistorted image at a tag's corners (4, 2); None if there is no distortion, or there are no rays."""
+    """Return the undistorted image at a tag's corners (4, 2); None without distortion, or if a corner has no ray."""
     if lens is None or lens.model == "none":
         return None
     points = np.vstack([corners_px, corners_px.mean(axis=0)])

@@ -20,10 +20,11 @@ FAMILIES = {
     "36h11": cv2.aruco.DICT_APRILTAG_36h11,
 }
 Cells = NDArray[np.uint8]
-# Threads run these side by side; what a degenerate quadrilateral divides by zero is not a number, and compares so.
+# Without the GIL, so that threads run side by side. With numpy's error model, as degenerate quadrilaterals divide by 0:
+# the results are NaN, and fail all comparisons.
 compiled = _compiled.compiled(nogil=True, error_model="numpy")
-_SHARPEN = 0.25  # of what a cell is over each of its neighbours is added to it, as in AprilTag 3
-_SPREAD = 0.25  # of a cell, between the nine places where its level is taken
+_SHARPEN = 0.25  # share of a cell's excess over each of its neighbours that is added to the cell, as in AprilTag 3
+_SPREAD = 0.25  # spacing, in cells, of the nine points at which a cell's level is taken
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,8 +32,8 @@ class Codebook:
     """The tags of a family.
 
     Attributes:
-        side: cells along a side, black border included. numbers: (T,).
-        cells: (T, side, side), first row on top, as AprilTag's own images have them; 1 is white.
+        family: its name. side: number of cells along a side, black border included. numbers: (T,) ids.
+        cells: (T, side, side), first row on top, as in AprilTag's own images; 1 is white.
         codes: (T, 4) bits of the data cells, row by row, of a tag turned by 0, 1, 2, 3 quarters anticlockwise.
     """
 
@@ -44,7 +45,7 @@ class Codebook:
 
 
 def codebook(family: str, numbers: Collection[int] | None = None) -> Codebook:
-    """Return a family's tags, or those with some numbers.
+    """Return all tags of a family, or the ones with some numbers.
 
     Raises:
         ConfigError: the family is unknown, or has no such number.
@@ -69,7 +70,11 @@ def codebook(family: str, numbers: Collection[int] | None = None) -> Codebook:
 
 @compiled
 def homography(corners, side):  # type: ignore[no-untyped-def]
-    """Return the matrix (3, 3) from cells to px; cells: x right, y down from the first corner in [0, side]; corners (4, 2) clockwise."""
+    """Return the homography (3, 3) from cells to px.
+
+    Args:
+        corners: (4, 2), px, clockwise. side: of the tag, in cells: x right, y down from the first corner, in [0, side].
+    """
     au, av, bu, bv = corners[0, 0], corners[0, 1], corners[1, 0], corners[1, 1]
     cu, cv, du, dv = corners[2, 0], corners[2, 1], corners[3, 0], corners[3, 1]
     su, sv = au - bu + cu - du, av - bv + cv - dv
@@ -84,14 +89,14 @@ def homography(corners, side):  # type: ignore[no-untyped-def]
 
 @compiled
 def mapped(H, x, y):  # type: ignore[no-untyped-def]
-    """Return the point that a homography (3, 3) makes of (x, y), and the inverse of its denominator."""
+    """Return the image of (x, y) under a homography (3, 3), and 1 / its denominator."""
     z = 1.0 / (H[2, 0] * x + H[2, 1] * y + H[2, 2])
     return (H[0, 0] * x + H[0, 1] * y + H[0, 2]) * z, (H[1, 0] * x + H[1, 1] * y + H[1, 2]) * z, z
 
 
 @compiled
 def bilinear(grey, u, v):  # type: ignore[no-untyped-def]
-    """Return the grey level at a point, -1 outside of the image."""
+    """Return the interpolated grey level at a point; -1 outside the image."""
     j, i = int(np.floor(u)), int(np.floor(v))
     if not (0 <= j < grey.shape[1] - 1 and 0 <= i < grey.shape[0] - 1):
         return -1.0
@@ -102,7 +107,10 @@ def bilinear(grey, u, v):  # type: ignore[no-untyped-def]
 
 @compiled
 def spots(corners, side):  # type: ignore[no-untyped-def]
-    """Return nine points in each cell of a quadrilateral (4, 2) and of the cells around it (9 (side + 2)^2, 2), row by row."""
+    """Return nine points in each cell of a quadrilateral (4, 2), px, and of the ring of cells around it, row by row.
+
+    They are (9 (side + 2)^2, 2), px.
+    """
     H = homography(corners, side)
     found = np.empty((9 * (side + 2) ** 2, 2))
     n = 0
@@ -117,7 +125,7 @@ def spots(corners, side):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cell(grey, px, first):  # type: ignore[no-untyped-def]
-    """Return the mean level of nine points from the first on, -1 if they are not all in the image."""
+    """Return the mean level of nine points from index `first` on; -1 if not all are in the image."""
     total = 0.0
     for k in range(first, first + 9):
         level = bilinear(grey, px[k, 0], px[k, 1])
@@ -129,10 +137,14 @@ def _cell(grey, px, first):  # type: ignore[no-untyped-def]
 
 @compiled
 def _over(grey, px, side, values):  # type: ignore[no-untyped-def]
-    """Write each cell's level above the mean of black and white there (side, side); return whether the whole tag is visible.
+    """Write into values (side, side) each cell's level above the local mean of black and white.
 
-    Black is a plane through the border's cells, white one through the cells around it. Both sets are symmetric, so three sums give
-    the plane. If the image cuts off cells of the white, its slope is left out; if none is left, the brightest cell is white.
+    Black is a plane through the levels of the border cells, white a plane through those of the ring around it. Both
+    sets of cells are symmetric, so three sums give a plane. If the image cuts off cells of the ring, white has the
+    slope of black; if no cell of the ring is left, the brightest cell is white.
+
+    Returns:
+        Whether the whole tag is visible, and white is brighter than black.
     """
     half = 0.5 * side
     sums, squares, counts = np.zeros((2, 3)), np.zeros(2), np.zeros(2)
@@ -170,7 +182,7 @@ def _over(grey, px, side, values):  # type: ignore[no-untyped-def]
 
 @compiled
 def _bits_off(a, b):  # type: ignore[no-untyped-def]
-    """Return the number of different bits: sums of 2, 4, 8 neighbours, then of all bytes."""
+    """Return the number of different bits, by sums over 2, 4, 8 neighbours, then over all bytes."""
     x = a ^ b
     x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
     x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
@@ -183,11 +195,11 @@ def read(grey, px, side, codes):  # type: ignore[no-untyped-def]
     """Return the tag nearest to the bits in a quadrilateral.
 
     Args:
-        px: its `spots`.
+        grey: image. px: `spots` of the quadrilateral. side: in cells. codes: (T, 4) of the codebook.
 
     Returns:
-        Index in codes (T, 4), or -1; quarter turns anticlockwise; number of different bits; decision margin, grey levels
-        (AprilTag 3: mean distance of white or of black data cells to the mean, whichever is smaller).
+        Index of the tag, or -1; its quarter turns anticlockwise; number of different bits; decision margin, grey levels
+        (as in AprilTag 3: mean distance of the white or the black data cells to the threshold, whichever is smaller).
     """
     values = np.empty((side, side))
     if not _over(grey, px, side, values):

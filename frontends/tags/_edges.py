@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Corners of a decoded tag, by fitting the image of the whole tag, all edges at once.
 
-A pixel's grey level is (D black^g + (1 - D) white^g)^(1/g). D: share of its light from black cells, that is the tag's cells under a
-homography and a Gaussian blur; black and white: planes over the tag; g: the camera's encoding of light. A tag has edges from dark
-to bright and from bright to dark, so effects that widen white (gamma, glare, exposure) are separated from a shift of a corner.
+A pixel's grey level is (D black^g + (1 - D) white^g)^(1/g). D: share of its light from black cells, by the tag's cells
+under a homography and a Gaussian blur; black and white: planes over the tag; g: gamma, the camera's encoding of light.
+A tag has edges from dark to bright and from bright to dark, so effects that widen white (gamma, glare, exposure) are
+separated from a shift of a corner.
 """
 
 from __future__ import annotations
@@ -19,26 +20,28 @@ from graphloc.frames import Array
 from graphloc.frontends.tags._bow import Unbowed
 from graphloc.frontends.tags._decode import compiled, homography, mapped
 
-_ROUNDS = (1200, 5000)  # about how many pixels are looked at: of a wide tag, some
-_FLOOR_PX, _BLENDED_PX = 0.015, 0.15  # 1 sigma of a corner, whatever the image; and times the square of blur over cell
-_QUIET = 0.8  # cells around a tag that are surely white
+_ROUNDS = (1200, 5000)  # about how many pixels are used, in the first fit and the second; of a wide tag a sample
+# Least 1 sigma of a corner: in any image, and as a factor of (blur / cell)^2.
+_FLOOR_PX, _BLENDED_PX = 0.015, 0.15
+_QUIET = 0.8  # width of the surely white zone around a tag, cells
 _START_BLUR_PX2, _START_GAMMA = 0.25, 1.8
-_GAMMA_SIGMA, _BLUR_SIGMA_PX2 = 0.5, 1.0  # of what is fitted, before an image is seen
-_SLOPE_SIGMA = 0.3  # of black and white over a tag, of the contrast
-_BLURS_PX2, _GAMMAS = (0.08, 60.0), (0.8, 3.0)  # a pixel alone blurs by 1/12
-_CLIPPED, _LEAST_BLACK, _ROUNDING = 254.0 / 255.0, 0.002, 1e-6  # of white; variance of eight bits
+_GAMMA_SIGMA, _BLUR_SIGMA_PX2 = 0.5, 1.0  # prior sigmas
+_SLOPE_SIGMA = 0.3  # prior sigma of the slopes of black and white over a tag, as a share of the contrast
+_BLURS_PX2, _GAMMAS = (0.08, 60.0), (0.8, 3.0)  # allowed ranges; a pixel itself blurs by 1/12
+# Level from which a pixel is saturated; least level of black; least variance of a level, by eight bits.
+_CLIPPED, _LEAST_BLACK, _ROUNDING = 254.0 / 255.0, 0.002, 1e-6
 _ASTRAY_PX, _ASTRAY_CELLS = 2.0, 1.5  # a fit that ends farther away has left the tag
-_TOO_SURE = 1.4  # times the variance: glare and motion are no Gaussian blur
-_BLOCKS = 4  # along a side: pixels of a block are wrong together
+_TOO_SURE = 1.4  # factor on the covariance: glare and motion are no Gaussian blur
+_BLOCKS = 4  # blocks along a side: errors of the pixels of a block are correlated
 _N = 17  # corners u0 v0 .. u3 v3, blur along rows and columns, black, its slopes, white, its slopes, gamma
 _STEP_PX, _SETTLED_PX, _TURNS, _MOST_DAMPED = 1e-4, 0.02, 14, 1e4
-_CELLS = 24  # that the light of a pixel comes from at most, along a side
+_CELLS = 24  # most cells along a side from which the light of a pixel comes
 _EVEN_U, _EVEN_V = 0.7548776662466927, 0.5698402909980532  # multiples of them fill the unit square evenly (Roberts' R2)
 _PEAK = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 class TagFit(NamedTuple):
-    """Corners (4, 2) of a tag, their covariance (8, 8), px^2, and the share of its pixels' variance that is explained."""
+    """Corners (4, 2) of a tag, their covariance (8, 8), and the share of its pixels' variance that is explained."""
 
     corners_px: Array
     cov_px2: Array
@@ -48,14 +51,15 @@ class TagFit(NamedTuple):
 def fit_tag(
     grey: NDArray[np.uint8], about_px: Array, cells: NDArray[np.uint8], straight: Unbowed | None = None
 ) -> TagFit | None:
-    """Fit a tag to an image; None if it does not converge near the given corners.
+    """Return the fit of a tag to an image; None if it does not converge near the given corners.
 
-    First with some of its pixels, then with more.
+    It is fitted to some of its pixels, then to more.
 
     Args:
+        grey: image.
         about_px: (4, 2) approximate corners: left and right end of the cells' first row, then clockwise.
         cells: (side, side), 1 is white.
-        straight: the image in which the tag's sides are straight, if it is not this one.
+        straight: image in which the tag's sides are straight; None: this one.
     """
     about = about_px if straight is None else straight.flat(about_px)
     prior: _Prior | None = None
@@ -86,14 +90,14 @@ def fit_tag(
 def _pixels(
     grey: NDArray[np.uint8], about_px: Array, corners: Array, side: int, most: int, straight: Unbowed | None
 ) -> tuple[Array, int]:
-    """Return the pixels (n, 3) of a tag and its quiet zone: undistorted u and v, and level; one per square of some side."""
+    """Return undistorted u, v and level (n, 3) of pixels of a tag and its quiet zone, and the step between pixels."""
     chosen, step = _chosen(grey.shape, about_px, side, most)
     flat = chosen if straight is None else straight.flat(chosen)
     return _inside(grey, chosen, flat, np.linalg.inv(homography(corners, side)), side), step
 
 
 class _Prior(NamedTuple):
-    """Parameters before the fit (17,), their inverse variances, and white's level above black's."""
+    """Prior of the parameters: values (17,), inverse variances (17,); and the contrast, white's level minus black's."""
 
     theta: Array
     info: Array
@@ -113,7 +117,7 @@ def _prior(pixels: Array, about_px: Array, cells: NDArray[np.uint8]) -> _Prior |
     theta, info = np.zeros(_N), np.full(_N, 1e-9)
     theta[:8] = about_px.ravel()
     theta[8:10] = _START_BLUR_PX2
-    theta[10] = max(black_level - 0.1 * contrast, _LEAST_BLACK)  # blur mixed the two
+    theta[10] = max(black_level - 0.1 * contrast, _LEAST_BLACK)  # blur has mixed black and white
     theta[13] = black_level + 1.1 * contrast
     theta[16] = _START_GAMMA
     info[8:10] = 1.0 / _BLUR_SIGMA_PX2**2
@@ -137,7 +141,7 @@ class _Rest(NamedTuple):
 
 
 def _settle(pixels: Array, cells: NDArray[np.uint8], prior: _Prior, start: _Rest | None) -> _Rest | None:
-    """Levenberg-Marquardt from the prior or an earlier result; None if the corners leave the tag."""
+    """Return the fit by Levenberg-Marquardt from the prior, or an earlier result; None if the corners leave the tag."""
     side, info = len(cells), prior.info
     astray_px = max(_ASTRAY_PX, _ASTRAY_CELLS * math.sqrt(_area(prior.theta[:8].reshape(4, 2))) / side)
     theta, variance = (prior.theta, (0.1 * prior.contrast) ** 2) if start is None else (start.theta, start.variance)
@@ -172,7 +176,7 @@ def _settle(pixels: Array, cells: NDArray[np.uint8], prior: _Prior, start: _Rest
 
 
 def _together(A: Array, b: Array, inverse: Array, variance: float) -> float:
-    """Return the variance of the blocks' pull on the corners, relative to that of independent pixels (Huber's sandwich)."""
+    """Return the variance of the blocks' pull on the corners over that of independent pixels (Huber's sandwich)."""
     P = inverse[:8] @ A / variance
     alone = np.trace(inverse[:8] @ A @ inverse[:, :8] / variance - P @ inverse @ P.transpose(0, 2, 1), axis1=1, axis2=2)
     return float(((b @ inverse[:, :8] / variance) ** 2).sum() / alone.sum())
@@ -200,7 +204,7 @@ def _normal(t):  # type: ignore[no-untyped-def]
 
 @compiled
 def _shares(x, s, first, w, dx, ds):  # type: ignore[no-untyped-def]
-    """Write the share of light at a point that comes from each cell from `first` on, blurred by s cells, and its derivatives."""
+    """Write the shares w of the light at x from the cells from `first` on, blurred by s cells, and dw / dx, dw / ds."""
     t0 = (first - x) / s
     p0, c0 = _normal(t0)
     for i in range(len(w)):
@@ -212,11 +216,11 @@ def _shares(x, s, first, w, dx, ds):  # type: ignore[no-untyped-def]
 
 @compiled
 def _model(theta, X, slopes, cells, u, v, J, w):  # type: ignore[no-untyped-def]
-    """Return a pixel's level, its derivatives J (17,), and the share of light from beyond the quiet zone.
+    """Return a pixel's level, and the share of its light from beyond the quiet zone; write the level's derivatives.
 
     Args:
-        X: (3, 3) matrix from px to cells. slopes: (8, 9) its derivatives by the corners' coordinates, row by row.
-        w: (6, 24) workspace.
+        theta: (17,) parameters. X: (3, 3) homography from px to cells. slopes: (8, 9) its derivatives by the corners'
+            coordinates, row by row. cells: (side, side). u, v: the pixel. J: (17,) output. w: (6, 24) workspace.
     """
     side = len(cells)
     x, y, z = mapped(X, u, v)
@@ -268,10 +272,10 @@ def _model(theta, X, slopes, cells, u, v, J, w):  # type: ignore[no-untyped-def]
 
 @compiled
 def _chosen(shape, corners, side, most):  # type: ignore[no-untyped-def]
-    """Return pixels (n, 2) of the box around a tag and its quiet zone, one per square of some side, and that side.
+    """Return pixels (n, 2) of the box around a tag and its quiet zone, one per square, and the side of a square.
 
-    The position in the square is pseudo-random: otherwise all pixels of a column would have the same distance to an edge that is
-    nearly vertical, and corners would be 0.073 px off instead of 0.044 (1600 pixels from 3 to 5 m in optimal light).
+    The position in the square is quasi-random: otherwise all pixels of a column would have equal distances to an edge
+    that is nearly vertical, and corners would be 0.073 px off instead of 0.044 (1600 pixels, 3 to 5 m, optimal light).
     """
     low_u, high_u, low_v, high_v = 1e9, -1e9, 1e9, -1e9
     area = 0.0
@@ -299,7 +303,7 @@ def _chosen(shape, corners, side, most):  # type: ignore[no-untyped-def]
 
 @compiled
 def _inside(grey, px, flat, X, side):  # type: ignore[no-untyped-def]
-    """Return pixels (n, 3), undistorted position and level in [0, 1], of those (m, 2) in the tag and quiet zone."""
+    """Return (n, 3) undistorted position and level in [0, 1] of the pixels (m, 2) that are in the tag or quiet zone."""
     found = np.empty((len(px), 3))
     n = 0
     for i in range(len(px)):
@@ -312,10 +316,14 @@ def _inside(grey, px, flat, X, side):  # type: ignore[no-untyped-def]
 
 @compiled
 def _gather(pixels, cells, theta, X, slopes, doubt):  # type: ignore[no-untyped-def]
-    """Return normal equations by block (n, 17, 17), (n, 17), for pixels of unit variance; weighted sum of squares; sum of weights.
+    """Return the normal equations by block, (n, 17, 17) and (n, 17), for pixels of unit variance.
 
     Args:
-        X, slopes: as for `_model`. doubt: variance of light from beyond the quiet zone over that of a pixel.
+        pixels: (m, 3). cells, theta, X, slopes: see `_model`.
+        doubt: ratio of the variance of light from beyond the quiet zone to that of a pixel.
+
+    Returns:
+        The equations, the weighted sum of squared errors, and the sum of weights.
     """
     side = len(cells)
     A, b = np.zeros((_BLOCKS * _BLOCKS, _N, _N)), np.zeros((_BLOCKS * _BLOCKS, _N))
@@ -325,7 +333,7 @@ def _gather(pixels, cells, theta, X, slopes, doubt):  # type: ignore[no-untyped-
         u, v = pixels[i, 0], pixels[i, 1]
         level, strange = _model(theta, X, slopes, cells, u, v, J, work)
         if pixels[i, 2] >= _CLIPPED and level >= pixels[i, 2]:
-            continue  # as it should be; how bright it was cannot be seen
+            continue  # a saturated pixel whose model is at least as bright tells no more
         weight = 1.0 / (1.0 + doubt * strange * strange)
         off = pixels[i, 2] - level
         x, y, _ = mapped(X, u, v)

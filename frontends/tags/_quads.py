@@ -11,33 +11,34 @@ from graphloc.frames import Array
 from graphloc.frontends.tags._decode import bilinear, compiled
 
 _TONE = np.rint(255.0 * (np.arange(256) / 255.0) ** 1.6).astype(np.uint8)  # half way from encoded to linear light
-_WINDOW_PX = 11  # black and white of the surroundings are looked for within
-_LEAST_CONTRAST, _MOST_NOISE = 4, 40  # grey levels between them, or it is all one: the median of the image, within
-_FULL = 0.75  # of a component's hull, what its largest quadrilateral takes at least
-_LEAST_SLOPE = 1.5  # grey levels over a pixel, across each side on average
-_MOST_UNEQUAL = 0.15  # contrast of a side over that of the strongest
-_OFF_PX, _STRAIGHT = 1.0, 0.5  # so large a share of a side's edge points lies within so much of a line
+_WINDOW_PX = 11  # window of the local darkest and brightest level
+# A window with a smaller range of levels is uniform: the median range in the image, limited to these.
+_LEAST_CONTRAST, _MOST_NOISE = 4, 40
+_FULL = 0.75  # least share of a component's hull that its largest quadrilateral fills
+_LEAST_SLOPE = 1.5  # least mean slope across each side, grey levels per pixel
+_MOST_UNEQUAL = 0.15  # least ratio of a side's contrast to that of the strongest side
+_OFF_PX, _STRAIGHT = 1.0, 0.5  # a side is straight if at least this share of its edge points is so near to a line
 
 
 def quads_in(grey: NDArray[np.uint8], min_side_px: float, cells: int) -> Array:
-    """Return dark quadrilaterals (Q, 4, 2), px, on their edges; clockwise as seen in the image.
+    """Return dark quadrilaterals (Q, 4, 2), px, aligned with their edges; clockwise as seen in the image.
 
     Args:
-        cells: along a side, of the family that has most.
+        grey: image. min_side_px: shorter sides are not sought. cells: largest number of cells along a side of a tag.
     """
     toned = cv2.LUT(grey, _TONE)
     box = np.ones((_WINDOW_PX, _WINDOW_PX), dtype=np.uint8)
     low, high = cv2.erode(toned, box), cv2.dilate(toned, box)
     noise = float(np.median(cv2.subtract(high[::8, ::8], low[::8, ::8])))
     contrast = int(np.clip(noise, _LEAST_CONTRAST, _MOST_NOISE))
-    # Not compiled as one: each compiled function contains, and optimises again, those that it calls.
+    # Not compiled as one function: a compiled function contains, and optimises again, all that it calls.
     found = _hulls(*_runs(toned, low, high, contrast), 0.7 * min_side_px)
     return np.asarray(found[_aligned(grey, found, cells)])
 
 
 @compiled
 def _aligned(grey, found, cells):  # type: ignore[no-untyped-def]
-    """Align quadrilaterals (n, 4, 2) with their edges; return whether each has them (n,)."""
+    """Align quadrilaterals (n, 4, 2) with their edges, in place; return (n,) whether each has four edges."""
     has = np.zeros(len(found), dtype=np.bool_)
     for k in range(len(found)):
         has[k] = _has_sides(grey, found[k]) and _straighten(grey, found[k], cells)
@@ -46,14 +47,17 @@ def _aligned(grey, found, cells):  # type: ignore[no-untyped-def]
 
 @compiled
 def _runs(toned, low, high, contrast):  # type: ignore[no-untyped-def]
-    """Return runs of dark pixels along rows (n, 2), first column and the one after the last; row, and a run of its component.
+    """Return runs of dark pixels along rows, and their connected components.
 
     There is no branch per pixel: at some 10^6 ends of runs, mispredicted branches would take most of the time.
+
+    Returns:
+        First column and the one after the last (n, 2); row (n,); parent (n,), another run of the component.
     """
     rows, columns = toned.shape
     ends = np.empty(2 * rows * (columns // 2 + 1), dtype=np.int32)
     row, parent = np.empty(len(ends) // 2, dtype=np.int32), np.empty(len(ends) // 2, dtype=np.int32)
-    n = above = here = 0  # runs of the row above are [above, here)
+    n = above = here = 0  # indices of the runs of the row above are [above, here)
     for v in range(rows):
         inside, m = 0, 2 * n
         for u in range(columns):
@@ -89,7 +93,7 @@ def _root(parent, k):  # type: ignore[no-untyped-def]
 
 @compiled
 def _hulls(ends, row, parent, least):  # type: ignore[no-untyped-def]
-    """Return the largest quadrilateral (n, 4, 2) in the hull of each component that may be a tag."""
+    """Return the largest quadrilaterals (n, 4, 2) in the convex hulls of the components that may be tags."""
     n = len(row)
     left, right, bottom, area = ends[:, 0].copy(), ends[:, 1].copy(), row.copy(), np.zeros(n, dtype=np.int64)
     for i in range(n):
@@ -97,7 +101,8 @@ def _hulls(ends, row, parent, least):  # type: ignore[no-untyped-def]
         parent[i] = k
         left[k], right[k], bottom[k] = min(left[k], ends[i, 0]), max(right[k], ends[i, 1]), row[i]
         area[k] += ends[i, 1] - ends[i, 0]
-    place = np.full(n, -1, dtype=np.int64)  # of a component's first row in what follows; its top is its first run's row
+    # Index, in `begin` and `end`, of a component's first row, which is the row of its first run.
+    place = np.full(n, -1, dtype=np.int64)
     total = count = 0
     for k in range(n):
         width, height = right[k] - left[k], bottom[k] - row[k] + 1
@@ -124,10 +129,10 @@ def _hulls(ends, row, parent, least):  # type: ignore[no-untyped-def]
 
 @compiled
 def _hull(begin, end, top):  # type: ignore[no-untyped-def]
-    """Return the convex hull (n, 2), clockwise in the image, of rows of pixels from begin to end."""
+    """Return the convex hull (n, 2), clockwise in the image, of pixel rows from `top` on, each from begin to end."""
     height = len(begin)
     hull = np.empty((2 * height, 2))
-    n = low = np.int64(0)  # a literal 0 is a type of its own, for which `_append` would be compiled, too
+    n = low = np.int64(0)  # a literal 0 has its own type, for which `_append` would be compiled again
     for v in range(height):  # down the right side
         n = _append(hull, low, n, end[v], top + v)
     low = n
@@ -138,7 +143,7 @@ def _hull(begin, end, top):  # type: ignore[no-untyped-def]
 
 @compiled
 def _append(hull, low, n, u, v):  # type: ignore[no-untyped-def]
-    """Append a point after removing those since `low` that it makes concave; return their new number."""
+    """Append a point to a hull, after removing points since `low` that it makes concave; return the new length."""
     while n > low + 1 and (hull[n - 1, 0] - hull[n - 2, 0]) * (v - hull[n - 2, 1]) <= (
         hull[n - 1, 1] - hull[n - 2, 1]
     ) * (u - hull[n - 2, 0]):
@@ -149,7 +154,7 @@ def _append(hull, low, n, u, v):  # type: ignore[no-untyped-def]
 
 @compiled
 def _farthest(hull, i, j):  # type: ignore[no-untyped-def]
-    """Return the vertex of a clockwise hull that is farthest outwards from the line from vertex i to j."""
+    """Return the vertex of a clockwise hull that is farthest outside the line from vertex i to vertex j."""
     best, at = -1.0, i
     du, dv = hull[j, 0] - hull[i, 0], hull[j, 1] - hull[i, 1]
     for k in range(len(hull)):
@@ -161,8 +166,8 @@ def _farthest(hull, i, j):  # type: ignore[no-untyped-def]
 
 @compiled
 def _largest(hull, quad, dark, least):  # type: ignore[no-untyped-def]
-    """Write a hull's largest quadrilateral, found by moving one corner at a time; return whether it may be a tag's."""
-    c = np.zeros(4, dtype=np.int64)  # the first vertex is a corner of the hull, and what is farthest from it is another
+    """Write a hull's largest quadrilateral, found by moving one corner at a time; return whether it may be a tag."""
+    c = np.zeros(4, dtype=np.int64)  # start: the first vertex, the one farthest from it, the farthest to either side
     far = 0.0
     for k in range(len(hull)):
         away = np.hypot(hull[k, 0] - hull[0, 0], hull[k, 1] - hull[0, 1])
@@ -203,7 +208,7 @@ def _shortest(quad):  # type: ignore[no-untyped-def]
 
 @compiled
 def _has_sides(grey, quad):  # type: ignore[no-untyped-def]
-    """Return whether it is brighter outside of every side, by similar amounts."""
+    """Return whether it is brighter outside each side of a quadrilateral (4, 2), by similar amounts."""
     least, most = 1e9, -1e9
     for k in range(4):
         du, dv = quad[(k + 1) % 4, 0] - quad[k, 0], quad[(k + 1) % 4, 1] - quad[k, 1]
@@ -219,10 +224,10 @@ def _has_sides(grey, quad):  # type: ignore[no-untyped-def]
 
 @compiled
 def _straighten(grey, quad, cells):  # type: ignore[no-untyped-def]
-    """Align a quadrilateral (4, 2) with the edges next to it, dark inside; return whether each side has one.
+    """Align a quadrilateral (4, 2), dark inside, with the edges next to it, in place; return whether each side has one.
 
-    Each side becomes a line through the steepest points of profiles across it. Within a cell to either side there is no other edge
-    from dark to bright.
+    Each side becomes a line through the steepest points of profiles across it. The profiles reach a cell to either
+    side, within which a tag has no other edge from dark to bright.
     """
     before = _area(quad)
     reach = min(max(_shortest(quad) / cells, 1.5), 6.0)
@@ -245,7 +250,7 @@ def _straighten(grey, quad, cells):  # type: ignore[no-untyped-def]
 
 @compiled
 def _line(grey, p, q, reach, line):  # type: ignore[no-untyped-def]
-    """Write the line (4,), point and direction, of an edge near the segment from p to q; return whether there is a straight one."""
+    """Write the line (4,), point and direction, of an edge near the segment from p to q; return if it is straight."""
     long = np.hypot(q[0] - p[0], q[1] - p[1])
     du, dv = (q[0] - p[0]) / long, (q[1] - p[1]) / long
     n = max(8, min(32, int(long)))

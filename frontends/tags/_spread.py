@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Uncertainty of a single tag's pose beyond the curvature at its minimum.
 
-Seen frontally, a tag's tilt shows as 1 - cos, to second order. The likelihood of a tilt then has two flat wells that merge, and
-the distance changes with it along a curve. Here the likelihood is summed over a grid of tilts, with the other parameters
-(position, rotation about the normal) optimised at each. The result is the second moment about the minimum, over the tilts nearer
-to it than to another minimum.
+Seen frontally, a tag's tilt shows as 1 - cos, to second order. The likelihood of a tilt then has two flat wells that
+merge, and the distance changes with it along a curve. Here the likelihood is summed over a grid of tilts, with the
+other parameters (position, rotation about the normal) optimised at each. The result is the second moment about the
+minimum, over the tilts nearer to it than to another minimum.
 """
 
 from __future__ import annotations
@@ -16,22 +16,24 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array
 
-_POINTS = 15  # a side of the grid
-_REACH = 3.5  # sigmas of the curvature's covariance
+_POINTS = 15  # points along a side of the grid
+_REACH = 3.5  # half the side of the grid, in sigmas of the curvature's covariance
 _STEEPEST_RAD = float(np.radians(70.0))
 _ROUNDS = 3
-_NEAREST = 0.05  # of the distance: where a step may take a corner at most
+_NEAREST = 0.05  # least share of the tag's distance that a step may leave
 
 
 def spread(
     corners_m: Array, rays: Array, whiten: Array, R: Array, t_m: Array, curvature: Array, others: Sequence[Array]
 ) -> tuple[Array, float]:
-    """Return the second moment (6, 6) of (position of the tag's middle in camera, rotation about camera's axes), and log evidence.
+    """Return the second moment (6, 6) of a tag's pose about a minimum, and the log evidence of the minimum.
+
+    The pose is the position of the tag's middle in camera, then the rotation about the camera's axes.
 
     Args:
         corners_m: (4, 3) in world. rays: (4, 2). whiten: (8, 8), makes the rays' errors unit and uncorrelated.
-        R, t_m: the minimum, world in camera. curvature: (6, 6) covariance by the curvature there.
-        others: attitudes (3, 3) of the other minima.
+        R, t_m: pose of world in camera at the minimum. curvature: (6, 6) covariance by the curvature at the minimum.
+        others: attitudes (3, 3) at the other minima.
     """
     there = corners_m @ R.T + t_m
     middle, arms = there.mean(axis=0), there - there.mean(axis=0)
@@ -44,7 +46,7 @@ def spread(
     turned = Rotation.from_rotvec(w).as_matrix()
     tilted = np.einsum("gij,nj->gni", turned, arms)
     normal = turned @ axes[2]
-    rest = np.zeros((len(w), 4))  # place, turn about the normal
+    rest = np.zeros((len(w), 4))  # shift, rotation about the normal
     for _ in range(_ROUNDS):
         r, J = _linear(tilted, normal, middle, rest, rays, whiten)
         A = J.transpose(0, 2, 1) @ J
@@ -71,7 +73,7 @@ def spread(
 def _linear(
     tilted: Array, normal: Array, middle: Array, rest: Array, rays: Array, whiten: Array
 ) -> tuple[Array, Array]:
-    """Return whitened errors (G, 8) of tilted corners (G, 4, 3), and their Jacobian (G, 8, 4) by position and rotation."""
+    """Return whitened errors (G, 8) of tilted corners (G, 4, 3), and their Jacobian (G, 8, 4) by `rest`."""
     spun = tilted + rest[:, 3, None, None] * np.cross(normal[:, None, :], tilted)
     there = middle + rest[:, None, :3] + spun
     z = np.maximum(there[:, :, 2:], 0.01)

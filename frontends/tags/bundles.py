@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sightings from the tags of one image: those of one frame together, those that contradict the rest separately."""
+"""Sightings from the tags of one image: tags of one frame together, tags that contradict the others separately."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from graphloc.frontends.tags.pose import KEPT, PoseOfCamera, modes_of, poses_of
 from graphloc.measurements import TagSighting
 from graphloc.survey import Survey, TagConfig
 
-# Corners fit with the noise that they are said to have, up to so many times its variance; beyond, a tag does not
-# belong to the others.
+# Ratio of the squared error of corners to its expectation by their noise from which a tag contradicts the others.
 CONTRADICTS = 6.0
 
 
@@ -25,8 +24,8 @@ class SeenTag:
     """A tag in an image.
 
     Attributes:
-        tag: its survey. rays, cov: (4, 2) of its corners, and their covariance (8, 8).
-        fitted: the rays were computed from a pose, which they fit perfectly, so that the fit is no evidence for it.
+        tag: its entry in the survey. rays, cov: (4, 2) of its corners, and their covariance (8, 8).
+        fitted: whether the rays were computed from a pose: they fit it perfectly, which is no evidence for it.
     """
 
     tag: TagConfig
@@ -37,7 +36,10 @@ class SeenTag:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeing:
-    """Camera and stamp; floor: least noise of a ray per axis, 1 sigma; px: size of a pixel as a ray."""
+    """An image: its stamp, sensor, camera, and the camera's mount.
+
+    `floor`: least noise of a ray, 1 sigma of an axis. `px`: size of a pixel as a ray.
+    """
 
     stamp_ns: int
     sensor: str
@@ -63,12 +65,13 @@ def sightings_of(seen: Sequence[SeenTag], survey: Survey, seeing: Seeing) -> tup
 
 
 class Bundle:
-    """Tags of one frame taken together.
+    """Tags of one frame, taken together.
 
     Attributes:
-        points_m, rays: (4 K, 3) corners in world at rest, (4 K, 2). seen_cov, cov: (8 K, 8 K) covariance of the rays by the
-            image, and with the survey's errors.
-        poses: that explain them; none if nothing does. excess: ratio of the squared error to its expectation.
+        group: the K tags. points_m: (4 K, 3) their corners in world, with the frame at rest. rays: (4 K, 2).
+        seen_cov: (8 K, 8 K) covariance of the rays by the image. cov: the same with the survey's errors.
+        dof: degrees of freedom. poses: of the camera, that explain the rays; empty if none does.
+        excess: ratio of the squared error of the best pose to its expectation.
     """
 
     def __init__(self, group: Sequence[SeenTag], survey: Survey, frame: str) -> None:
@@ -102,9 +105,10 @@ class Bundle:
         return np.asarray(block_diag(*shares))
 
     def doubt(self) -> None:
-        """Widen the noise of the corners if no pose fits as expected, since they are then blurred or partly hidden; drop poor minima.
+        """Widen the noise of the corners if no pose fits as expected; then drop poor minima of several tags.
 
-        Minima are dropped only afterwards: with the claimed noise of blurred corners, all but one would be.
+        Corners that do not fit are blurred or partly hidden. With their claimed noise all minima but one would be
+        dropped.
         """
         if self.excess > chi2_95(self.dof) / self.dof:
             self.cov, self.seen_cov = self.cov * self.excess, self.seen_cov * self.excess
@@ -114,9 +118,10 @@ class Bundle:
 
 
 def _that_fit(seen: Sequence[SeenTag], survey: Survey, frame: str) -> list[Bundle]:
-    """Return groups of tags that one pose explains; three or more can show which is wrong, two cannot.
+    """Return groups of tags that one pose explains.
 
-    Tags that fit no better without each other are all blurred: they stay together and get a larger noise together.
+    Three tags or more can show which one is wrong; two cannot, and are separated. Tags that fit no better without each
+    other are all blurred: they stay together, and get a larger noise together.
     """
     whole, alone = Bundle(seen, survey, frame), list[Bundle]()
     while len(whole.group) > 1 and whole.excess > CONTRADICTS:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras: from image points to rays in the optical frame and back, by `sensor_msgs/CameraInfo`.
 
-A ray is (x/z, y/z) in the optical frame (x right, y down, z forward); image points are px, (0, 0) is the centre of the top-left
-pixel. With the lens d: rays -> rays of one of OpenCV's models,
+A ray is (x/z, y/z) in the optical frame (x right, y down, z forward); image points are px, (0, 0) is the centre of the
+top-left pixel. The lens d, from rays to rays, is one of OpenCV's models:
 
     px = K[:2, :2] d(ray) + K[:2, 2].
 """
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array
 
-# `sensor_msgs/distortion_models.hpp`, with the numbers of coefficients that OpenCV takes.
+# Models of `sensor_msgs/distortion_models.hpp`, with the numbers of coefficients that OpenCV takes.
 _COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 _ALIASES = {"fisheye": "equidistant", "kannala_brandt4": "equidistant"}
 _WIDEST_RAD = np.radians(89.9)  # x/z grows beyond all bounds at 90 deg
-_CLOSE = 1e-9  # of a ray: 1e-6 px at a focal length of 1000 px
-_STEPS = 20  # Newton's takes three or four
+_CLOSE = 1e-9  # tolerance of a ray: 1e-6 px at a focal length of 1000 px
+_STEPS = 20  # most of Newton's steps; three or four are usual
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +33,7 @@ class CameraModel:
 
     Attributes:
         width_px, height_px: of its images; 0 if unknown.
-        K: (3, 3), from rays through the lens to px.
+        K: (3, 3), from rays that the lens has distorted to px.
         model: 'plumb_bob', 'rational_polynomial', 'equidistant' or 'none'.
         distortion: the model's coefficients (n,) in OpenCV's order.
     """
@@ -47,8 +47,9 @@ class CameraModel:
     def rays(self, corners_px: Array) -> Array:
         """Return the rays (N, 2) of image points (N, 2), with distortion removed.
 
-        NaN where there is none: outside the image of a lens whose model folds (k1 = -0.5 maps rays beyond 0.82 back inwards), close to
-        that fold, and from 89.9 deg off the axis on. Of several rays of one point, the one within the fold is returned.
+        A model may fold: k1 = -0.5 maps rays beyond 0.82 back inwards. Of several rays of one point, the one within the
+        fold is returned. NaN where a point has no ray: outside the image of a lens that folds, close to the fold, and
+        from 89.9 deg off the axis on.
         """
         flat = (corners_px - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
         if self.model == "none" or not len(flat):
@@ -70,7 +71,7 @@ class CameraModel:
         return np.asarray(found)
 
     def project(self, rays: Array) -> Array:
-        """Return the image points (N, 2), px, of rays (N, 2); NaN where `rays` would not return these."""
+        """Return the image points (N, 2), px, of rays (N, 2); NaN where `rays` would not return the ray again."""
         if self.model == "none" or not len(rays):
             flat = rays
         else:
@@ -85,7 +86,7 @@ class CameraModel:
         return np.asarray(self.K[:2, :2] @ self._through_lens(rays)[1])
 
     def check_size(self, width_px: int, height_px: int) -> None:
-        """Raise ValueError if an image does not have the size of this camera's images, if that is known."""
+        """Raise a `ValueError` if an image does not have the size of the camera's images, where that is known."""
         if not self.width_px or not self.height_px or (width_px, height_px) == (self.width_px, self.height_px):
             return
         hint = ""
@@ -99,7 +100,7 @@ class CameraModel:
         return _distorted(self.model, self.distortion, rays)
 
     def _within(self, rays: Array, slope: Array) -> NDArray[np.bool_]:
-        """Return whether the lens's model can be inverted at rays (N, 2): they are within its fold, if it has one."""
+        """Return (N,) whether the lens's model can be inverted at rays (N, 2), that is within its fold."""
         radii, _ = _radii(self.model, tuple(self.distortion))
         return np.asarray((np.linalg.norm(rays, axis=1) <= radii[-1]) & (np.linalg.det(slope) > 0.0))
 
@@ -107,7 +108,7 @@ class CameraModel:
 def _distorted(model: str, distortion: Array, rays: Array) -> tuple[Array, Array]:
     """Return d(ray) (N, 2) and its derivative (N, 2, 2).
 
-    At z = 1 a ray moves like a translation of the camera, for which OpenCV gives the derivative.
+    At z = 1 a shift of the ray equals a translation of the camera, for which OpenCV gives the derivative.
     """
     points = np.column_stack([rays, np.ones(len(rays))])[:, None]
     still, plain = np.zeros(3), np.eye(3)
@@ -123,9 +124,9 @@ def _distorted(model: str, distortion: Array, rays: Array) -> tuple[Array, Array
 
 @lru_cache(maxsize=64)
 def _radii(model: str, distortion: tuple[float, ...]) -> tuple[Array, Array]:
-    """Return lengths of rays (n,), ascending, and of their images (n,), up to the fold of the model.
+    """Return the lengths of rays (n,), ascending, and of the distorted rays (n,), up to the fold of the model.
 
-    Only the radial part: without tangential terms, prism and tilt.
+    They are of the radial part only, without tangential terms, prism and tilt.
     """
     round_only = np.array(distortion)
     if model != "equidistant":
@@ -140,12 +141,13 @@ def _radii(model: str, distortion: tuple[float, ...]) -> tuple[Array, Array]:
 def camera_of(msg: Any, *, rectified: bool) -> CameraModel:
     """Return the camera of a `sensor_msgs/CameraInfo` of ROS 1 or 2.
 
-    Region of interest and binning are applied: a pixel of the image is the mean of `binning` ones of the region.
-    `image_geometry` omits the half pixel of that.
+    Region of interest and binning are applied: a pixel of the image is the mean of `binning` pixels of the region. This
+    shifts its centre by a fraction of a pixel, which `image_geometry` omits.
 
     Args:
-        rectified: the images are `image_rect`: P is theirs, and they have no distortion. Rays are then in the axes of the
-            rectified image; those of a stereo camera are rotated by R from its optical frame.
+        msg: the message.
+        rectified: whether the images are `image_rect`: then P is their matrix, and they have no distortion. Rays are in
+            the axes of the rectified image, which for a stereo camera are rotated by R from its optical frame.
 
     Raises:
         ValueError: the message has no calibration, or an unknown lens model.
@@ -154,7 +156,7 @@ def camera_of(msg: Any, *, rectified: bool) -> CameraModel:
     model, distortion = ("none", np.empty(0)) if rectified else _lens(msg)
     roi = msg.roi
     offset = np.array([roi.x_offset, roi.y_offset])
-    binning = np.array([msg.binning_x or 1, msg.binning_y or 1])  # 0 is as 1
+    binning = np.array([msg.binning_x or 1, msg.binning_y or 1])  # 0 means 1
     to_image = np.diag([*(1.0 / binning), 1.0])
     to_image[:2, 2] = (0.5 - offset) / binning - 0.5
     whole = np.maximum(np.array([msg.width, msg.height]) - offset, 0)
@@ -177,7 +179,7 @@ def _matrix(msg: Any, *, rectified: bool) -> Array:
 
 
 def _lens(msg: Any) -> tuple[str, Array]:
-    """Return model and coefficients (n,). No coefficients mean no distortion, except for an equidistant lens."""
+    """Return model and coefficients (n,). Zero coefficients mean no distortion, except for an equidistant lens."""
     named = str(msg.distortion_model)
     model = _ALIASES.get(named.strip().lower(), named.strip().lower())
     coefficients = _field(msg, "D")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""AprilTags in grey images: which they are, their corners, and the covariance of these.
+"""AprilTags in grey images: their ids, their corners, and the covariance of the corners.
 
-Three steps: dark quadrilaterals (`_quads`), whose bits are in the codebook or nearly (`_decode`), and to which the whole tag is
-fitted (`_edges`), with edges curved by the lens if that is known (`_bow`); the bits are read again at the fitted corners.
+Steps: find dark quadrilaterals (`_quads`); keep those whose bits are nearly in the codebook (`_decode`); fit the whole
+tag (`_edges`), with edges curved by the lens if that is known (`_bow`); read the bits again at the fitted corners.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from graphloc.frontends.tags._quads import quads_in
 from graphloc.frontends.tags.camera import CameraModel
 
 _THREADS = 2
-_STRIPS, _OVERLAP_PX = 3, 96  # what is taller than the overlap is found at half the resolution
-_MORE_BITS = 2  # that may be wrong as long as the corners are rough
-_LEAST_EXPLAINED = 0.4  # of the variance of a tag's pixels, by the tag
+_STRIPS, _OVERLAP_PX = 3, 96  # tags that are taller than the overlap are found at half the resolution
+_MORE_BITS = 2  # so many more bits may be wrong as long as the corners are rough
+_LEAST_EXPLAINED = 0.4  # least share of the variance of a tag's pixels that the fit explains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,11 +36,11 @@ class Detection:
 
     Attributes:
         number: its id in its family. family: e.g. "36h11".
-        corners_px: (4, 2) u, v; the centre of the top-left pixel is (0, 0). In the order of the tag's own axes (x right,
-            y up, z out of the print): (-,+), (+,+), (+,-), (-,-), which is top-left, top-right, bottom-right, bottom-left
-            of the print as AprilTag's own images stand.
+        corners_px: (4, 2) u, v; the centre of the top-left pixel is (0, 0). In the order of the tag's own axes (x
+            right, y up, z out of the print): (-,+), (+,+), (+,-), (-,-), which is top-left, top-right, bottom-right,
+            bottom-left of the print as AprilTag's own images stand.
         cov_px2: (8, 8) covariance of u0, v0, u1, v1, ...
-        hamming: bits corrected. margin: AprilTag's decision margin, grey levels.
+        hamming: number of corrected bits. margin: AprilTag's decision margin, grey levels.
     """
 
     number: int
@@ -52,7 +52,7 @@ class Detection:
 
 
 class _Candidate(NamedTuple):
-    """A quadrilateral (4, 2), px, whose first corner is that of tag `tag` of `book`, and the number of different bits."""
+    """A quadrilateral (4, 2), px, that starts at the first corner of tag `tag` of `book`; `off`: different bits."""
 
     book: Codebook
     tag: int
@@ -64,8 +64,8 @@ class Detector:
     """Finds AprilTags. It has no state between images and can be shared by threads.
 
     Args:
-        families: of `16h5`, `25h9`, `36h10`, `36h11`. 16h5 has so few bits that any dark square may match: give `numbers`,
-            and no bits to correct.
+        families: of `16h5`, `25h9`, `36h10`, `36h11`. 16h5 has so few bits that any dark square may match: give
+            `numbers`, and no bits to correct.
         max_hamming: number of bits that may be wrong.
         min_margin: least decision margin, grey levels.
         min_side_px: tags with shorter sides on average are not sought.
@@ -91,7 +91,8 @@ class Detector:
         """Return the tags that are wholly visible in an image (rows, columns), on two threads; lowest number first.
 
         Args:
-            lens: of an image with distortion: edges of a tag are then fitted as curves. Corners stay points of the image.
+            grey: the image. lens: of an image with distortion: the edges of a tag are then fitted as curves. Corners
+                stay points of the image.
         """
         if min(grey.shape, default=0) < self._min_side_px or not self._books:
             return []
@@ -103,19 +104,23 @@ class Detector:
         return sorted(found, key=lambda d: (d.family, d.number, d.corners_px[0, 0]))
 
     def _candidates(self, grey: NDArray[np.uint8], scale: float, top: int) -> list[_Candidate]:
-        """Return quadrilaterals with nearly a tag's bits, of a part of the image that is reduced by a factor, from row `top` on."""
+        """Return the quadrilaterals of a part of an image whose bits are nearly those of a tag.
+
+        Args:
+            grey: the part, reduced by the factor `scale`. top: its first row in the image.
+        """
         found = []
         for quad in quads_in(grey, self._min_side_px / scale, max(book.side for book in self._books)):
             for book in self._books:
                 tag, turned, off, _ = read(grey, spots(quad, book.side), book.side, book.codes)
                 if off <= self._max_hamming + _MORE_BITS:
-                    # A pixel of the half image has its centre between those of four.
+                    # A pixel of the half image has its centre between those of four pixels.
                     corners = scale * np.roll(quad, turned, axis=0) + 0.5 * (scale - 1.0) + np.array([0.0, top])
                     found.append(_Candidate(book, tag, corners, off))
         return found
 
     def _settled(self, grey: NDArray[np.uint8], lens: CameraModel | None, candidate: _Candidate) -> Detection | None:
-        """Return the tag fitted to the image, if its bits there are those of a tag."""
+        """Return the tag fitted to the image; None if it does not fit, or if the bits at its corners are no tag's."""
         book = candidate.book
         straight = unbowed(lens, candidate.corners_px)
         fitted = fit_tag(grey, candidate.corners_px, book.cells[candidate.tag], straight)
@@ -132,16 +137,16 @@ class Detector:
 
 
 def _read_only(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a view as images of a bag are: loops are compiled for one kind of array, not once more for what may be written to."""
+    """Return a read-only view, as images of a bag are: else loops would be compiled again for writable arrays."""
     image = image.view()
     image.flags.writeable = False
     return image
 
 
 def parts_of(grey: NDArray[np.uint8]) -> list[tuple[NDArray[np.uint8], float, int]]:
-    """Return the image at half the resolution, for tall tags, noise and blur, and strips of it, to be shared by threads.
+    """Return the parts of an image that threads search: the image at half the resolution, and strips of it.
 
-    Each comes with its reduction and its first row in the image.
+    The former is for tall tags, noise and blur. Each part comes with its reduction and its first row in the image.
     """
     half = np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     half = _read_only(half)
@@ -151,7 +156,7 @@ def parts_of(grey: NDArray[np.uint8]) -> list[tuple[NDArray[np.uint8], float, in
 
 
 def _distinct(candidates: Iterable[_Candidate]) -> list[_Candidate]:
-    """Drop detections at the position of another one with fewer different bits."""
+    """Return the candidates without those at the position of another one with fewer different bits."""
     kept: list[_Candidate] = []
     for candidate in sorted(candidates, key=lambda c: c.off):
         middle, width = candidate.corners_px.mean(axis=0), np.ptp(candidate.corners_px, axis=0).max()

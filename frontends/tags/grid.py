@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A survey in a map grid, as surveyors give it: its tags, docks and berths in world."""
+"""Conversion of a survey in a map grid, as surveyors give it, to world: its tags, docks and berths."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from pyproj.transformer import AreaOfInterest, TransformerGroup
 from graphloc.frames import Array, Datum
 from graphloc.survey import WORLD, Survey
 
-_AHEAD_M = 10.0  # over which the direction of grid north is taken
-_FAR_M = 50e3  # from the datum: another zone, or northing and easting swapped
-_LOOSE_M = 1.5  # a tie to WGS 84 that is less sure than that is worth a word; those of ETRS 89 say 1 m
+_AHEAD_M = 10.0  # distance over which the direction of grid north is computed
+_FAR_M = 50e3  # farther from the datum, the zone is wrong, or northing and easting are swapped
+_LOOSE_M = 1.5  # a tie to WGS 84 with a larger uncertainty is warned of; ties of ETRS 89 state 1 m
 
 log = logging.getLogger(__name__)
 
 
 def in_world(survey: Survey, datum: Datum) -> Survey:
-    """Return a survey whose places are east, north, up from a datum; as it is, if they are already.
+    """Return a survey whose positions are east, north, up from a datum; one without a grid is returned as it is.
 
-    Grid north is not true north, and a metre of a grid not always a metre: each place is converted by itself, and each direction by
-    that of grid north there. Places and directions on a dock are the dock's, as before.
+    Grid north is not true north, and a metre of a grid is not always a metre: each position is converted by itself, and
+    each direction by that of grid north at its position. Positions and directions on a dock stay in the dock's frame.
 
     Raises:
-        ValueError: the grid is unknown, does not count metres east and north, or has heights of its own; or a place is not in it, or
-            is farther than 50 km from the datum.
+        ValueError: the grid is unknown, does not count metres east and north, or has heights of its own; or a position
+            is not in it, or is farther than 50 km from the datum.
     """
     if not survey.grid:
         return survey
@@ -63,14 +63,14 @@ class _Grid:
         try:
             crs = CRS.from_user_input(name)
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # that a better tie needs a file: said below
+                warnings.simplefilter("ignore", UserWarning)  # a better tie needs a file; loose ones are logged below
                 ties = TransformerGroup(crs, 4326, always_xy=True, area_of_interest=here).transformers
         except ProjError:
             raise ValueError(f"grid {name} is not known") from None
         axes = {(axis.direction, axis.unit_name) for axis in crs.axis_info[:2]}
         if not ties or not crs.is_projected or axes != {("east", "metre"), ("north", "metre")}:
             raise ValueError(f"grid {name} ({crs.name}) does not count metres east and north")
-        if crs.is_compound:  # its heights are above the sea
+        if crs.is_compound:  # its heights are above sea level
             flat = crs.sub_crs_list[0].name
             raise ValueError(
                 f"grid {name} ({crs.name}) has heights of its own: name that of {flat} alone, and give heights above the ellipsoid"
@@ -81,7 +81,11 @@ class _Grid:
         self._name, self._datum = name, datum
 
     def placed(self, what: str, xyz_m: tuple[float, float, float]) -> tuple[tuple[float, float, float], float]:
-        """Return a place (easting, northing, height above the ellipsoid) in world, and where grid north points there, deg from north."""
+        """Return a position in world, and the direction of grid north at it, deg clockwise from true north.
+
+        Args:
+            what: its name, for errors. xyz_m: easting, northing, height above the ellipsoid.
+        """
         east, north, height = xyz_m
         here, ahead = self._world(np.array([[east, north, height], [east, north + _AHEAD_M, height]]))
         if not np.isfinite([here, ahead]).all():
@@ -101,6 +105,6 @@ class _Grid:
 
 
 def _yawed(rpy_deg: tuple[float, float, float], north_deg: float) -> tuple[float, float, float]:
-    """Return an attitude in world of one in a grid whose north is so far clockwise of true north."""
+    """Return an attitude in world from one in a grid whose north is `north_deg` clockwise of true north."""
     roll, pitch, yaw = rpy_deg
     return roll, pitch, yaw - north_deg

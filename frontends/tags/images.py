@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image messages to grey images."""
+"""Conversion of image messages to grey images."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 Grey = NDArray[np.uint8]
 _MOST_PIXELS = 100_000_000
-# Numbers of a pixel, and what makes it grey; None: it is. Those of 16 bits have 16 for 8 in their names.
+# By encoding: channels, and OpenCV's conversion to grey, None if it is grey. Encodings of 16 bits are the same with 16
+# for 8 in the name.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "mono8": (1, None), "8UC1": (1, None),
     "rgb8": (3, cv2.COLOR_RGB2GRAY), "bgr8": (3, cv2.COLOR_BGR2GRAY), "8UC3": (3, cv2.COLOR_BGR2GRAY),
@@ -26,7 +27,9 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
 
 
 def grey_image(msg: Any, msgtype: str) -> Grey:
-    """Return the image (rows, columns) of a message decoded by rosbags; 16 bits are scaled to the brightest pixel.
+    """Return the grey image (rows, columns) of a message decoded by rosbags.
+
+    Images of 16 bits are scaled to the brightest pixel.
 
     Raises:
         ValueError: it has no image, or one in an unsupported format.
@@ -71,7 +74,7 @@ def _raw(msg: Any) -> Grey:
 
 
 def _eight_bits(pixels: NDArray[np.uint16]) -> Grey:
-    """Return pixels scaled to the brightest: cameras of 10 to 14 bits leave the upper ones empty."""
+    """Return pixels scaled to the brightest one: cameras of 10 to 14 bits leave the upper bits empty."""
     scale = 255.0 / max(int(pixels.max()), 255)
     return np.asarray(cv2.convertScaleAbs(pixels.astype(np.float32), alpha=scale), dtype=np.uint8)
 
@@ -96,7 +99,7 @@ def _compressed(data: Grey) -> Grey:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Return width and height in a JPEG's frame header; None if there is none."""
+    """Return the width and height in a JPEG's frame header; None if it has none."""
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""AprilTags detected by another program, from messages in the bag: corners in the image, or a pose of each."""
+"""AprilTags that another program detected, from messages in the bag: corners in the image, or the pose of each tag."""
 
 from __future__ import annotations
 
@@ -21,17 +21,16 @@ _SQUARE = np.array([(-1.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (-1.0, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ListedTag:
-    """A detection. Corners are those of the print: top left, top right, bottom right, bottom left.
+    """A detection. Corners are in the order of the print: top left, top right, bottom right, bottom left.
 
     Attributes:
-        family: such as 'tag36h11'; '' if not stated.
-        hamming: corrected bits; None if not stated, as `margin`.
-        margin: AprilTag's decision margin, grey levels.
+        number: id. family: such as 'tag36h11'; '' if not stated.
+        hamming: number of corrected bits. margin: AprilTag's decision margin, grey levels. None if not stated.
         size_m: edge length configured in the detecting program; None if not stated.
         corners_px: (4, 2) px, (0, 0) is the centre of the top-left pixel, in the image that was searched (usually
             `image_rect`); None if `rays` is given.
-        rays: (4, 2), x/z and y/z in the optical frame: corners of a pose that was fitted. They have no residual, so that they
-            do not show which of the two planar poses fits better.
+        rays: (4, 2), x/z and y/z in the optical frame, of the corners of a fitted pose; None if `corners_px` is given.
+            They have no residual, so they do not show which of the two planar poses fits better.
     """
 
     number: int
@@ -47,7 +46,7 @@ def read_list(msg: Any, msgtype: str) -> tuple[list[ListedTag], list[str]]:
     """Return the tags of a list of detections, and a line for each entry that cannot be used.
 
     Args:
-        msgtype: one of `LISTS`.
+        msg: the list. msgtype: one of `LISTS`.
     """
     reader = _READERS[msgtype]
     tags, unusable = [], []
@@ -64,8 +63,8 @@ def read_list(msg: Any, msgtype: str) -> tuple[list[ListedTag], list[str]]:
 def _with_corners(entry: Any) -> ListedTag:
     """Read an `apriltag_msgs/AprilTagDetection`, the output of AprilTag 3.
 
-    AprilTag counts corners from the print's bottom left, counter-clockwise, and px from the outer corner of the top-left pixel.
-    Messages of 2018 have the corners as eight numbers.
+    AprilTag counts corners from the print's bottom left, counter-clockwise, and px from the outer corner of the
+    top-left pixel. Messages of 2018 hold the corners as eight numbers.
     """
     corners = [(c.x, c.y) if hasattr(c, "x") else c for c in entry.corners]
     corners_px = np.array(corners, dtype=float).reshape(4, 2)[::-1] - 0.5
@@ -74,7 +73,7 @@ def _with_corners(entry: Any) -> ListedTag:
     along = np.roll(corners_px, -1, axis=0) - corners_px
     following = np.roll(along, -1, axis=0)
     turns = along[:, 0] * following[:, 1] - along[:, 1] * following[:, 0]
-    if not (turns > 0.0).all():  # to the right: y is down
+    if not (turns > 0.0).all():  # clockwise in the image, as y is down
         raise ValueError(f"tag {entry.id}: its corners are no quadrilateral in AprilTag's order (counter-clockwise)")
     margin = float(entry.decision_margin)
     return ListedTag(
@@ -84,16 +83,16 @@ def _with_corners(entry: Any) -> ListedTag:
 
 
 def _family(name: str) -> str:
-    """Return AprilTag's own name of a family, which `apriltag_detector` calls 'tf36h11'."""
+    """Return AprilTag's own name of a family, 'tag36h11' for `apriltag_detector`'s 'tf36h11'."""
     known = re.fullmatch(r"(?:tf|tag)?((?:Standard|Circle|Custom)?\d+h\d+)", name)
     return f"tag{known[1]}" if known else name
 
 
 def _with_pose(entry: Any) -> ListedTag:
-    """Read an `apriltag_ros/AprilTagDetection` of ROS 1: the pose of the tag in the optical frame, from its four corners.
+    """Read an `apriltag_ros/AprilTagDetection` of ROS 1: the pose of a tag in the optical frame, from its four corners.
 
-    That program takes AprilTag's px for OpenCV's: its rays are half a pixel, 0.5 px / focal length, too far right and down. The
-    message has no focal length to correct that.
+    `apriltag_ros` takes AprilTag's px for OpenCV's: its rays are half a pixel, 0.5 px / focal length, too far right and
+    down. The message has no focal length to correct that.
     """
     numbers = [int(n) for n in entry.id]
     if len(numbers) != 1 or len(entry.size) != 1:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses of a camera that explain its view of tags: every minimum of the reprojection error, with its covariance.
 
-The four corners of a tag have two poses (infinitesimal plane-based pose estimation, Collins & Bartoli 2014, gives both); those of
-several tags together mostly have one. Each is refined to the minimum of the whitened error.
+The four corners of a tag have two poses, which infinitesimal plane-based pose estimation (IPPE, Collins & Bartoli 2014)
+gives; the corners of several tags mostly have one. Each pose is refined to the minimum of the whitened error.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from graphloc.frontends.tags._spread import spread
 from graphloc.measurements import TagMode
 
 _ROUNDS = 30
-_SETTLED = 1e-7  # step, m and rad
-_SAME = 1e-3  # normalised distance of two solutions that are one
+_SETTLED = 1e-7  # step, m and rad, from which a minimum is reached
+_SAME = 1e-3  # squared normalised distance below which two solutions are one
 _NEAREST_M = 0.05
-_FARTHEST = 2000.0  # sizes of a tag: it is less than a pixel there, and corners without sense lead there
-_TRIED = 4  # starts, of several tags
-KEPT = 25.0  # a minimum whose squared error is larger by that is none
+# In sizes of a tag: farther away it is smaller than a pixel; meaningless corners lead there.
+_FARTHEST = 2000.0
+_TRIED = 4  # most starts that are tried, and most poses that are returned
+KEPT = 25.0  # minima whose squared error exceeds that of the best by more are dropped
 _UNLIKELIEST = 1e-9
-# Where a tag is seen from straight ahead its tilt does not show to first order, and a minimum's curvature says
-# nothing of it: what all tilts that one sees a tag under say instead.
+# Prior sigma of a rotation: the range of tilts at which tags are seen. A tag seen from straight ahead does not show its
+# tilt to first order, so the curvature at a minimum says nothing of it.
 _ANY_TILT_RAD = float(np.radians(40.0))
 
 
@@ -38,8 +39,8 @@ class PoseOfCamera:
     """A minimum of the reprojection error.
 
     Attributes:
-        R, t_m: world in camera: x_camera = R x_world + t. squared: whitened squared error.
-        information: (6, 6) of (position of the points' middle in camera, rotation about camera's axes).
+        R, t_m: pose of world in camera: x_camera = R x_world + t. squared: whitened squared error.
+        information: (6, 6) of the position of the points' middle in camera, then the rotation about the camera's axes.
     """
 
     R: Array
@@ -51,11 +52,11 @@ class PoseOfCamera:
 def poses_of(
     points_m: Array, rays: Array, cov: Array, starts: Sequence[tuple[Array, Array]] = ()
 ) -> list[PoseOfCamera]:
-    """Return the poses that explain the rays, best first; none if nothing does.
+    """Return the poses that explain the rays, the best first; empty if none does.
 
     Args:
-        points_m: (4 K, 3) corners of K tags in turn, in world. rays: (4 K, 2) their rays.
-        cov: (8 K, 8 K) of the rays. starts: initial (R, t), world in camera; default: each tag's own two poses.
+        points_m: (4 K, 3) corners of K tags, tag by tag, in world. rays: (4 K, 2) of the corners.
+        cov: (8 K, 8 K) of the rays. starts: initial (R, t) of world in camera; default: the two poses of each tag.
     """
     whiten = np.linalg.inv(np.linalg.cholesky(cov))
     found: list[PoseOfCamera] = []
@@ -70,7 +71,7 @@ def poses_of(
 
 
 def _starts(corners_m: Array, rays: Array) -> list[tuple[Array, Array]]:
-    """Return both poses (R, t), world in camera, by one tag."""
+    """Return the two poses (R, t) of world in camera by one tag."""
     middle = corners_m.mean(axis=0)
     x, y = corners_m[1] - corners_m[0], corners_m[0] - corners_m[3]
     axes = np.column_stack([x / np.linalg.norm(x), y / np.linalg.norm(y), np.zeros(3)])
@@ -85,8 +86,7 @@ def _starts(corners_m: Array, rays: Array) -> list[tuple[Array, Array]]:
         (np.asarray(cv2.Rodrigues(turn)[0], dtype=float), np.asarray(place[:, 0], dtype=float))
         for turn, place in zip(turns, places, strict=True)
     ]
-    # IPPE gives one alone, or the same twice, where it meets a tag from straight ahead; and exactly there numbers
-    # that are none, or the tag from behind.
+    # Near straight ahead IPPE gives one pose only, or one twice; exactly there it gives NaN, or the tag from behind.
     found = [(R, t) for R, t in found if np.isfinite(R).all() and np.isfinite(t).all()]
     found = [(R, t) for R, t in found if t[2] > _NEAREST_M and np.linalg.det(R) > 0.5 and R[:, 2] @ t < 0.0]
     R, t = found[0] if found else _facing(float(np.linalg.norm(x)), rays)
@@ -95,7 +95,7 @@ def _starts(corners_m: Array, rays: Array) -> list[tuple[Array, Array]]:
 
 
 def _facing(side_m: float, rays: Array) -> tuple[Array, Array]:
-    """Return the frontal pose (R, t) of a tag, rotated as the rays (4, 2) of its corners are."""
+    """Return the frontal pose (R, t) of a tag, rotated about the optical axis as the rays (4, 2) of its corners are."""
     x = 0.5 * (rays[1] + rays[2] - rays[0] - rays[3])
     length = max(float(np.linalg.norm(x)), 1e-9)
     x = x / length if length > 1e-9 else np.array([1.0, 0.0])
@@ -105,27 +105,27 @@ def _facing(side_m: float, rays: Array) -> tuple[Array, Array]:
 
 
 def _mirrored(R: Array, t: Array) -> Array:
-    """Return the attitude whose normal is mirrored at the line of sight."""
+    """Return the attitude of a tag with its normal mirrored at the line of sight."""
     sight, normal = t / np.linalg.norm(t), R[:, 2]
     axis = np.cross(normal, -sight)
     length = float(np.linalg.norm(axis))
     tilt = float(np.arctan2(length, -normal @ sight))
-    if length < 1e-3:  # straight ahead: either way
+    if length < 1e-3:  # straight ahead: a tilt in any direction
         axis, length, tilt = np.cross(normal, R[:, 0]), 1.0, 0.1
     return np.asarray(Rotation.from_rotvec(2.0 * tilt * axis / length).as_matrix() @ R)
 
 
 @compiled
 def _descended(arms_m, rays, whiten, R, there):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt: move R (3, 3) and the middle in camera, there (3,), to a minimum, in place.
+    """Move R (3, 3) and the middle in camera, there (3,), to a minimum by Levenberg-Marquardt, in place.
 
-    Loops are written out, as numba takes seconds to compile what numpy would do for them.
+    Loops are written out: numba takes seconds to compile numpy's functions.
 
     Args:
-        arms_m: (4 K, 3) from the middle, in world. rays: (4 K, 2). whiten: (8 K, 8 K).
+        arms_m: (4 K, 3) points from their middle, in world. rays: (4 K, 2). whiten: (8 K, 8 K).
 
     Returns:
-        The squared error there, negative where points are behind the camera to begin with; the information (6, 6).
+        The squared error at the minimum, -1 if points are behind the camera at the start; the information (6, 6).
     """
     size = len(whiten)
     raw, r, J, A = np.empty((size, 7)), np.empty(size), np.empty((size, 7)), np.empty((6, 6))
@@ -164,10 +164,13 @@ def _descended(arms_m, rays, whiten, R, there):  # type: ignore[no-untyped-def]
 
 @compiled
 def _linearised(arms_m, rays, R, there, raw):  # type: ignore[no-untyped-def]
-    """Fill in the derivatives of the rays at a pose, and their errors in the last column of raw (8 K, 7); return whether all are ahead.
+    """Write the derivatives of the rays at a pose into raw (8 K, 7), their errors into its last column.
 
-    With its arm from the middle, (x, y, z) in camera, and its ray (u, v) at some depth, a shift and a rotation about the middle change
-    that of a point by d u = (1, 0, -u) / depth (shift + turn x arm), and so for v.
+    A point has the arm (x, y, z) from the middle, in camera, and the ray (u, v). A shift and a rotation about the
+    middle change u by (1, 0, -u) / depth (shift + turn x arm), and v likewise.
+
+    Returns:
+        Whether all points are ahead of the camera.
     """
     ahead = True
     for n in range(len(arms_m)):
@@ -189,7 +192,7 @@ def _linearised(arms_m, rays, R, there, raw):  # type: ignore[no-untyped-def]
 
 @compiled
 def _squared(whiten, raw, r):  # type: ignore[no-untyped-def]
-    """Fill in the whitened errors (8 K,), and return the sum of their squares."""
+    """Write the whitened errors into r (8 K,), and return the sum of their squares."""
     total = 0.0
     for i in range(len(whiten)):
         r[i] = 0.0
@@ -201,7 +204,7 @@ def _squared(whiten, raw, r):  # type: ignore[no-untyped-def]
 
 @compiled
 def _normal_equations(whiten, raw, r, J, A):  # type: ignore[no-untyped-def]
-    """Fill in the whitened derivatives, with the errors in the last column of J (8 K, 7), and the information A (6, 6)."""
+    """Write the whitened derivatives into J (8 K, 7), errors into its last column, the information into A (6, 6)."""
     size = len(whiten)
     for i in range(size):
         for k in range(6):
@@ -219,7 +222,7 @@ def _normal_equations(whiten, raw, r, J, A):  # type: ignore[no-untyped-def]
 
 @compiled
 def _damped_step(A, J, damping, L, step):  # type: ignore[no-untyped-def]
-    """Fill in the damped step (6,), by Cholesky; not numbers, which are no progress, where A is not positive."""
+    """Write the damped step (6,), by Cholesky; NaN, which makes no progress, if A is not positive definite."""
     for i in range(6):
         for j in range(i + 1):
             value = A[i, j] + (damping * A[i, j] + 1e-9 if i == j else 0.0)
@@ -242,7 +245,7 @@ def _damped_step(A, J, damping, L, step):  # type: ignore[no-untyped-def]
 
 @compiled
 def _rotation(a, b, c, turn):  # type: ignore[no-untyped-def]
-    """Fill in the rotation (3, 3) by a vector (a, b, c), rad: Rodrigues' formula."""
+    """Write the rotation by a vector (a, b, c), rad, into turn (3, 3), by Rodrigues' formula."""
     angle = math.sqrt(a * a + b * b + c * c)
     sine = math.sin(angle) / angle if angle > 0.0 else 1.0
     rest = (1.0 - math.cos(angle)) / (angle * angle) if angle > 0.0 else 0.5
@@ -258,10 +261,10 @@ def _misfit(points_m: Array, rays: Array, whiten: Array, R: Array, t: Array) -> 
 
 
 def _refine(points_m: Array, rays: Array, whiten: Array, R: Array, t: Array) -> PoseOfCamera | None:
-    """Return the minimum that an initial pose leads to; None if it is behind the points, or leads nowhere."""
+    """Return the minimum to which an initial pose leads; None if points are behind the camera, or too far away."""
     middle = points_m.mean(axis=0)
     R, there = np.array(R, dtype=float, order="C"), R @ middle + t
-    # Copies, which may be written to: the loops are compiled for these alone.
+    # Writable copies: the loops are compiled for such arrays only.
     squared, information = _descended(points_m - middle, np.array(rays, dtype=float, order="C"), whiten, R, there)
     if squared < 0.0 or there[2] > _FARTHEST * float(np.linalg.norm(points_m[1] - points_m[0])):
         return None
@@ -282,8 +285,8 @@ def modes_of(
     """Return the poses as modes, the likeliest first.
 
     Args:
-        poses: by `poses_of`, of the same points_m, rays and cov.
-        blind: do not use the fit as evidence.
+        poses: of `poses_of` with these points_m, rays and cov.
+        blind: whether the fit is not used as evidence.
     """
     found = _weighed(poses, points_m, rays, cov)
     logs = np.array([log + (0.5 * pose.squared if blind else 0.0) for (_, log), pose in zip(found, poses, strict=True)])
@@ -292,7 +295,7 @@ def modes_of(
     modes = []
     for k in np.argsort(-shares):
         R_world_camera, moment = poses[k].R.T, found[k][0].copy()
-        moment[:3, 3:], moment[3:, :3] = -moment[:3, 3:], -moment[3:, :3]  # the camera turns as the tags turn back
+        moment[:3, 3:], moment[3:, :3] = -moment[:3, 3:], -moment[3:, :3]  # the camera turns opposite to the tags
         modes.append(
             TagMode(
                 p_world_camera_m=-R_world_camera @ poses[k].t_m,
@@ -305,7 +308,7 @@ def modes_of(
 
 
 def _weighed(poses: Sequence[PoseOfCamera], points_m: Array, rays: Array, cov: Array) -> list[tuple[Array, float]]:
-    """Return covariance (6, 6) and log evidence of each pose: summed over tilts for one tag, by the curvature for several."""
+    """Return covariance (6, 6) and log evidence of each pose: of one tag by a sum over tilts, else by the curvature."""
     tilted = np.diag([0.0] * 3 + [_ANY_TILT_RAD**-2] * 3)
     curved = [np.asarray(np.linalg.inv(pose.information + tilted), dtype=float) for pose in poses]
     if len(points_m) > 4:
@@ -317,5 +320,6 @@ def _weighed(poses: Sequence[PoseOfCamera], points_m: Array, rays: Array, cov: A
         spread(points_m, rays, whiten, p.R, p.t_m, c, [o.R for o in poses if o is not p])
         for p, c in zip(poses, curved, strict=True)
     ]
-    # A hopeless minimum (of a tag that fills the image) may weigh one tilt of the grid alone: no covariance.
+    # Of a poor minimum (a tag that fills the image) a single tilt of the grid may have all weight: a singular
+    # covariance.
     return [(moment + 1e-3 * c, log) for (moment, log), c in zip(found, curved, strict=True)]

@@ -31,8 +31,8 @@ from graphloc.survey import TagConfig
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
-_NO_FOCAL_PX = 1000.0  # of a list of poses without a CameraInfo, for the noise of its corners
-_OTHER_SIZE = 0.02  # from which a tag's size in a list contradicts the survey's
+_NO_FOCAL_PX = 1000.0  # focal length that is assumed, for the noise of corners, of lists of poses without a CameraInfo
+_OTHER_SIZE = 0.02  # relative difference from which a tag's size in a list contradicts the survey's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,9 +40,10 @@ class Seen:
     """Result of one message.
 
     Attributes:
-        sightings: of surveyed tags; may be empty. views: of tags that are not surveyed.
-        troubles: a line for each part that could not be used. doubtful: the same for tags that a limit (`max_hamming`,
-            `min_margin`) excluded.
+        stamp_ns, camera: of the message. sightings: of surveyed tags; may be empty. views: of tags that are not
+            surveyed.
+        troubles: a line for each part that could not be used. doubtful: a line for each tag that a limit
+            (`max_hamming`, `min_margin`) excluded.
     """
 
     stamp_ns: int
@@ -55,10 +56,11 @@ class Seen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Eye:
-    """A configured camera, with its topics in the bag.
+    """A configured camera.
 
     Attributes:
-        listed: it lists detections instead of images. lens: None for lists of poses without a CameraInfo.
+        name, topic: its name and topic. listed: whether the topic holds lists of detections instead of images.
+        lens: its calibration; None for lists of poses without a CameraInfo. mount: position (3,) and rotation (3, 3).
     """
 
     name: str
@@ -70,7 +72,7 @@ class _Eye:
 
 @dataclass(slots=True)
 class _Raw:
-    """Tags in a message: id, family, rays (4, 2), their covariance (8, 8), size and whether fitted."""
+    """Tags in a message: id, family, rays (4, 2), their covariance (8, 8), size, and whether of a fitted pose."""
 
     tags: list[tuple[int, str, Array, Array, float | None, bool]] = field(default_factory=list)
     troubles: list[str] = field(default_factory=list)
@@ -83,14 +85,15 @@ def sightings_of_bag(
     """Yield the result of each image and list of a bag.
 
     Args:
-        sensor: its name. config: its block, with the survey. warn: is called with each damage of the bag.
+        bags: see `read_recording`. sensor: its name. config: its block, with the survey. body_frame: in tf.
+        warn: called with each damage of the bag.
 
     Raises:
-        InputError: no camera, a missing topic or one of another type, no usable CameraInfo, or a mount without a chain of
-            transforms.
+        InputError: no camera, a missing topic or one of another type, no usable CameraInfo, or a mount without a chain
+            of transforms.
     """
     families = sorted({tag.family for tag in config.surveyed.tags}) or ["36h11"]
-    few_bits = [tag.id for tag in config.surveyed.tags if tag.family == "16h5"]  # anything dark is a tag of that family
+    few_bits = [tag.id for tag in config.surveyed.tags if tag.family == "16h5"]  # nearly any dark square is in 16h5
     detector = Detector(
         families, max_hamming=config.max_hamming, min_margin=config.min_margin,
         numbers={"16h5": few_bits} if few_bits else None,
@@ -100,7 +103,7 @@ def sightings_of_bag(
         ahead: deque[Future[Seen]] = deque()
         for raw in bag.messages({eye.topic for eye in eyes.values()}):
             ahead.append(pool.submit(_look, raw, _decoded(bag, raw), eyes[raw.topic], sensor, config, detector))
-            if len(ahead) > 2 * _cores():  # images are large: a few at a time
+            if len(ahead) > 2 * _cores():  # images are large: only a few are held
                 yield ahead.popleft().result()
         while ahead:
             yield ahead.popleft().result()
@@ -113,7 +116,11 @@ def _cores() -> int:
 
 
 def _eyes(bag: Bag, config: AprilTagConfig, body_frame: str, warn: Callable[[str], None]) -> dict[str, _Eye]:
-    """Return the cameras by topic."""
+    """Return the cameras by topic.
+
+    Raises:
+        InputError: see `sightings_of_bag`.
+    """
     if not config.cameras:
         raise InputError("vessel.yaml: an apriltag sensor needs `cameras`: name, topic and mount of each")
     mounts = mounts_of(bag, {name: c.mount for name, c in config.cameras.items()}, body_frame, "cameras")
@@ -148,7 +155,7 @@ def is_rectified(topic: str) -> bool:
 
 
 def _lens(bag: Bag, name: str, config: CameraConfig, listed: bool, warn: Callable[[str], None]) -> CameraModel | None:
-    """Return the camera's calibration, from the first message of its CameraInfo in the whole bag."""
+    """Return the camera's calibration by the first CameraInfo in the whole bag; None of a list without `info_topic`."""
     topic = config.info_topic
     if not topic and listed:
         return None
@@ -201,7 +208,7 @@ def _decoded(bag: Bag, raw: RawMessage) -> Any:
 
 
 def _look(raw: RawMessage, msg: Any, eye: _Eye, sensor: str, config: AprilTagConfig, detector: Detector) -> Seen:
-    """Return the tags of a message, with poses."""
+    """Return the result of a message."""
     try:
         if isinstance(msg, Exception):
             raise msg
@@ -248,7 +255,7 @@ def _listed(msg: Any, msgtype: str, eye: _Eye, config: AprilTagConfig) -> _Raw:
         elif tag.corners_px is not None and eye.lens is not None:
             _add(found, eye.lens, tag.number, tag.family, tag.corners_px, noise_px2, tag.size_m)
         elif tag.rays is not None:
-            # ROS 1's apriltag_ros takes AprilTag's pixels, whose middles are at 0.5, for OpenCV's.
+            # ROS 1's apriltag_ros takes AprilTag's px, in which pixels have their centres at 0.5, for OpenCV's.
             focal_px = np.full(2, _NO_FOCAL_PX) if eye.lens is None else np.diagonal(eye.lens.K)[:2]
             shifted = tag.rays - (0.0 if eye.lens is None else 0.5 / focal_px)
             found.tags.append((tag.number, tag.family, shifted, noise_px2 / float(focal_px[0]) ** 2, tag.size_m, True))
@@ -264,7 +271,7 @@ def _refused(tag: ListedTag, config: AprilTagConfig) -> str:
 
 
 def _sorted_out(shown: _Raw, stamp_ns: int, eye: _Eye, sensor: str, config: AprilTagConfig) -> Seen:
-    """Return sightings of surveyed tags, views of others, and ambiguous tags."""
+    """Return the result of a message: sightings of surveyed tags, views of others, and lines on unused tags."""
     survey, troubles = config.surveyed, list(shown.troubles)
     counts = Counter((number, family) for number, family, *_ in shown.tags)
     seen: list[SeenTag] = []
@@ -297,7 +304,7 @@ def _sorted_out(shown: _Raw, stamp_ns: int, eye: _Eye, sensor: str, config: Apri
 
 
 def _in_survey(tags: Sequence[TagConfig], number: int, family: str) -> TagConfig | None:
-    """Return the tag of the survey; of a list without families, the only one with that id."""
+    """Return the tag of the survey; if no family is stated, the only one with this id; else None."""
     fitting = [tag for tag in tags if tag.id == number and family in ("", tag.family)]
     return fitting[0] if len(fitting) == 1 else None
 

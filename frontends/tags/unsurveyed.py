@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Positions of tags that the survey does not list, from the solved track.
 
-    p_tag = p_i + s R_i t_i        t_i: position of a tag of size 1 in the camera of view i, s: its size
+    p_tag = p_i + s R_i t_i
 
-is linear in position and size; the attitude is that of the pose that fits most views; all three are refined on the corners. A tag
-that is only seen beside tags of one dock is taken to ride on it: p_i, R_i are then relative to the dock at rest.
+p_i, R_i: camera of view i in world; t_i: position, in this camera, of a tag of size 1; s: its size. The equations are
+linear in p_tag and s. The attitude starts from the pose that fits most views. Position, attitude and size are refined
+on the corners. A tag that is only seen beside tags of one dock is taken to ride on it: p_i, R_i are then relative to
+the dock at rest.
 """
 
 from __future__ import annotations
@@ -28,21 +30,21 @@ from graphloc.time import seconds_since, stamps_of
 from graphloc.trajectory import Trajectory
 
 _FEWEST = 5
-_MOST = 60  # views: more of them cost time, and share the track's error
-_TRIED = 12  # views whose poses are tried as a start
+_MOST = 60  # most views of a tag: more of them cost time, and share the track's error
+_TRIED = 12  # most views whose poses are tried as a start
 _UNIT = np.array([(-0.5, 0.5, 0.0), (0.5, 0.5, 0.0), (0.5, -0.5, 0.0), (-0.5, -0.5, 0.0)])
-# 1 sigma: a place, an attitude or a size (share) that is known no better is no survey
+# Largest sigmas of position, attitude and size (as a share) of a tag that counts as surveyed.
 _WELL_M, _WELL_RAD, _WELL_SIZE = 1.0, float(np.radians(10.0)), 0.1
-_LEAST_SIZE_M = 0.01  # seen from one place only, size and distance shrink together
-_TRACK_M, _TRACK_RAD = 0.1, float(np.radians(0.3))  # of a track that does not say how good it is
-_UNKNOWN = 100.0  # m, rad, share: sigma of what nothing tells
+_LEAST_SIZE_M = 0.01  # if a tag is seen from one place only, size and distance shrink together
+_TRACK_M, _TRACK_RAD = 0.1, float(np.radians(0.3))  # sigmas of a track without covariance
+_UNKNOWN = 100.0  # sigma of what nothing tells: m, rad, or share
 
 
 class _View:
     """A view with its camera in world: position p (3,), axes R (3, 3); rays (4, 2), and their whitening matrix (8, 8).
 
-    A track that is off by 0.1 m shifts all corners of a tag 4 m ahead by 25 px: its covariance is added to that of the rays;
-    otherwise the nearest views alone would decide, with the track's errors.
+    A track that is off by 0.1 m shifts all corners of a tag 4 m ahead by 25 px, so its covariance is added to that of
+    the rays. Otherwise the nearest views alone would decide, with the track's errors.
     """
 
     def __init__(self, view: TagView, p_world_body_m: Array, R_world_body: Array, track_cov: Array) -> None:
@@ -54,7 +56,7 @@ class _View:
         self.poses = poses_of(_UNIT, view.rays, view.cov)  # of a tag of size 1 m, in its own axes
 
     def doubt_track(self, size_m: float) -> None:
-        """Widen the rays by the track's error (dp, w): a corner P moves by -R' (dp + w x (P - p_body)) in the camera."""
+        """Add the track's error (dp, w) to the rays': a point P moves by -R^T (dp + w x (P - p_body)) in the camera."""
         corners = size_m * (_UNIT @ self.poses[0].R.T + self.poses[0].t_m)
         J = np.zeros((8, 6))
         for i, (x, y, z) in enumerate(corners):
@@ -71,14 +73,14 @@ class _View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Riding:
-    """Dock that tags ride on, and its motion from rest: stamps (M,), `moved` (M, 6), m and small rotations, rad."""
+    """A dock on which tags ride, and its motion from rest: stamps (M,), `moved` (M, 6), m and small rotations, rad."""
 
     dock: DockConfig
     stamps_ns: NDArray[np.int64]
     moved: Array
 
     def seen_from(self, track: Trajectory) -> Trajectory:
-        """Return a track relative to the dock at rest; its covariance, which includes the dock's, is kept."""
+        """Return a track relative to the dock at rest; its covariance stays, as if it included the dock's."""
         t, s = (seconds_since(int(track.stamps_ns[0]), stamps) for stamps in (track.stamps_ns, self.stamps_ns))
         moved = interpolated(t, s, self.moved)
         back, pivot = Rotation.from_rotvec(-moved[:, 3:]).as_matrix(), np.array(self.dock.xyz_m)
@@ -90,7 +92,7 @@ class Riding:
         )
 
     def on_board(self, tag: TagConfig) -> TagConfig:
-        """Return a tag that rides on the dock, from its position in world with the dock at rest."""
+        """Return a tag in the frame of the dock, from its pose in world with the dock at rest."""
         p, R = Survey(docks=(self.dock,)).rest(self.dock.name)
         return tag.model_copy(
             update={
@@ -102,7 +104,7 @@ class Riding:
 
 
 def only_beside(views: Sequence[TagView], sightings: Sequence[TagSighting]) -> dict[tuple[str, int], tuple[str, str]]:
-    """Return sensor and dock, by (family, id), of tags that share images only with tags of that dock."""
+    """Return by (family, id) the sensor and the dock of tags that share images only with tags of this dock."""
     images: dict[tuple[int, str], set[tuple[str, str]]] = defaultdict(set)
     for m in sightings:
         images[(m.stamp_ns, m.camera)].add((m.sensor, m.frame))
@@ -119,12 +121,12 @@ def estimate_tags(
     size_m: float | None,
     riding: Mapping[tuple[str, int], Riding] | None = None,
 ) -> tuple[list[TagConfig], list[str]]:
-    """Return the tags that are seen often and well enough, and a line for each other one.
+    """Return the tags that are seen often and well enough, and a line on each other tag.
 
     Args:
         views: of tags that are not surveyed. track: of the body, with covariance.
-        size_m: of these tags; None: estimated too.
-        riding: by (family, id) of those that ride on a dock; the others are at rest in world.
+        size_m: of these tags; None: it is estimated.
+        riding: by (family, id), of tags that ride on a dock; all others are at rest in world.
     """
     found: list[TagConfig] = []
     left: list[str] = []
@@ -148,9 +150,9 @@ def estimate_tags(
 
 
 def _estimate(own: Sequence[TagView], track: Trajectory, size_m: float | None) -> TagConfig | None:
-    """Return a tag from its views; None where these do not tell well where it is, or how large."""
+    """Return a tag from its views; None if they do not tell its pose and size well."""
     ordered = sorted(own, key=lambda v: v.stamp_ns)
-    stamps, where = np.unique([v.stamp_ns for v in ordered], return_inverse=True)  # two cameras may see it at once
+    stamps, where = np.unique([v.stamp_ns for v in ordered], return_inverse=True)  # two cameras may see it at one stamp
     at = track.at(stamps)
     views = [v for v in _along(at, ordered, where) if v.poses]
     if len(views) < _FEWEST:
@@ -180,14 +182,17 @@ def _estimate(own: Sequence[TagView], track: Trajectory, size_m: float | None) -
 
 
 def _along(at: Trajectory, ordered: Sequence[TagView], where: NDArray[np.intp]) -> Iterator[_View]:
-    """Yield the views with their cameras in world; `where`: which pose each has."""
+    """Yield the views with their cameras in world; `where`: index of each view's pose in `at`."""
     unsaid = np.diag([_TRACK_M**2] * 3 + [_TRACK_RAD**2] * 3)
     for view, k in zip(ordered, where.tolist(), strict=True):
         yield _View(view, at.p_world_m[k], at.R_world_body[k], unsaid if at.cov is None else at.cov[k])
 
 
 class _Refined(NamedTuple):
-    """A tag by the corners of all views: position (3,), attitude (3, 3), size, and 1 sigma of each; of the size as a share, 0 where it is known."""
+    """A tag by the corners of all views: position (3,), attitude (3, 3), size, and 1 sigma of each.
+
+    `sigma_size` is relative; 0 if the size is known.
+    """
 
     place: Array
     R: Array
@@ -198,7 +203,7 @@ class _Refined(NamedTuple):
 
 
 def _refined(views: Sequence[_View], place: Array, size_m: float, *, sized: bool) -> _Refined:
-    """Return position, attitude and, unless the tag is `sized`, size, refined from where `place` (3,) and `size_m` are near."""
+    """Return position, attitude and, unless it is known (`sized`), size, refined from `place` (3,) and `size_m`."""
     tried = [v.R @ pose.R for v in views[:: max(1, len(views) // _TRIED)] for pose in v.poses]
     R0 = min(tried, key=lambda R: sum(min(float(e @ e), 1e4) for e in (v.errors(place, R, size_m) for v in views)))
 
@@ -225,7 +230,7 @@ def _rpy_deg(R: Array) -> tuple[float, float, float]:
 
 
 def _placed(views: Sequence[_View], size_m: float | None) -> tuple[Array, float]:
-    """Return position (3,) and size of a tag by the linear equations of all views, the second time without outliers."""
+    """Return position (3,) and size of a tag by the linear equations of all views, solved again without outliers."""
     toward = np.array([v.R @ v.poses[0].t_m for v in views])
     p = np.array([v.p for v in views])
     kept = np.ones(len(views), dtype=bool)
