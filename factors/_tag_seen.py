@@ -59,9 +59,8 @@ class TagsSeen:
         self.rides, self.mounted, self.timed, self.edges = (len(r) > 0 for r in rows)
         self.own = [k for r in rows for k in r]
         self.slow = np.zeros(0)
-        if (
-            at.slow_value is not None
-        ):  # interpolated for tags on a dock; else that of the node: such sightings have no leaf
+        if at.slow_value is not None:
+            # Interpolated for tags on a dock; else that of the node: such sightings have no leaf.
             self.slow = (_between(at) if self.rides else np.asarray(at.slow_value))[self.own]
         self.moved = self.slow[:6] if self.rides else np.zeros(6)
         self.edge_px = float(self.slow[-1]) if self.edges else 0.0

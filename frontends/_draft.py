@@ -32,10 +32,8 @@ _MAGNETIC = ("HDG", "HDM")  # endings of the names of NMEA streams
 # with the gyro shows 0.6 deg by itself.
 _WANDER_DEG, _LARGER = 0.7, 1.4
 _LEEWAY_DEG = 5.0  # by which the mean course of a vessel may differ from her heading
-_DRIFTS = (
-    10.0,
-    600.0,
-)  # wander, deg, and its time constant, s, of a yaw without a north: cheap ones drift 1 deg in half a minute; a choice
+# Wander, deg, and its time constant, s, of a yaw without a north: cheap ones drift 1 deg in half a minute; a choice.
+_DRIFTS = (10.0, 600.0)
 _UNKNOWN_DEG = 10.0  # error of a magnetic compass on most coasts, 1 sigma
 _COMPASS_SIGMA_DEG = 2.0  # an offset up to this is covered by the default of a compass's mount offset
 

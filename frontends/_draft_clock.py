@@ -248,9 +248,8 @@ def scan_clock_lines(inspection: Inspection, lidars: tuple[MountedTopic, ...]) -
         return [
             f"  stamp_sigma_s: {_ON_ITS_WAY_S:.2f}  # guess: how long a message takes is not known; estimated with the run"
         ]
-    if (
-        imu_s is None or abs(imu_s) > EPOCH_LIMIT_S or not own_s
-    ):  # another clock than the IMU's is taken for the right one
+    # Another clock than the IMU's is taken for the right one.
+    if imu_s is None or abs(imu_s) > EPOCH_LIMIT_S or not own_s:
         return []
     ahead_s = imu_s - min(own_s)
     if -MOST_ON_ITS_WAY_S <= ahead_s <= SCANS_AHEAD_S:

@@ -458,9 +458,8 @@ def _no_velocity(value: Array) -> Rejection | None:
 
 def no_lock(value: ArrayLike) -> bool:
     """Return whether a velocity holds the value that Doppler logs write if they hear no echo."""
-    return bool(
-        (np.abs(np.abs(value) - NO_LOCK_MPS) < 1e-5).any()
-    )  # with a tolerance for float32, and of either sign, as axes may have been turned
+    # With a tolerance for float32, and of either sign, as axes may have been turned.
+    return bool((np.abs(np.abs(value) - NO_LOCK_MPS) < 1e-5).any())
 
 
 def _body_velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:

@@ -28,11 +28,8 @@ from graphloc.trajectory import Trajectory
 
 _MISLED = 0.25  # matches to scans that fit nowhere, below which the former are doubted
 _SURE = 0.5  # probability of a match's heading that counts for how the heading turns
-_TURNED_SIGMAS, _TOLD_RAD, _FEWEST = (
-    2.0,
-    np.radians(10.0),
-    5,
-)  # of the heading without matches; a larger sigma tells none
+# Of the heading without matches; a larger sigma than the second tells none.
+_TURNED_SIGMAS, _TOLD_RAD, _FEWEST = 2.0, np.radians(10.0), 5
 _ALIKE_RAD = np.radians(5.0)  # that right headings of matches differ by
 _FAR_OFF = 3.0  # sigmas of the clock
 _CUT_OFF = 0.1  # share of scans whose search windows were too small, above which they are matched once more

@@ -123,9 +123,8 @@ def _motion(t: Array, places_m: Array, sigma_m: float) -> tuple[float, float, fl
         Speed (m/s), noise of a place (m; the stated one, or the scatter if that is smaller), noise of the speed (m/s).
     """
     line = line_fit(t, places_m)
-    noise_m = min(
-        sigma_m, _scatter(line.left)
-    )  # many receivers state far more noise than they scatter by: with that, any boat would seem to stand
+    # Many receivers state far more noise than they scatter by: with that, any boat would seem to stand.
+    noise_m = min(sigma_m, _scatter(line.left))
     return float(np.linalg.norm(line.slope)), noise_m, noise_m * line.sigma
 
 

@@ -66,8 +66,7 @@ class Odometry:
         size = float(np.linalg.norm(lean))
         lean *= min(1.0, _LEAN_RAD / size) if size > 0.0 else 1.0
         R = gtsam.Rot3.Expmap(lean).matrix() @ R
-        self.R = R @ (
-            1.5 * np.eye(3) - 0.5 * R.T @ R
-        )  # Newton's step to the nearest rotation: rounding adds up over a day of steps
+        # Newton's step to the nearest rotation: rounding adds up over a day of steps.
+        self.R = R @ (1.5 * np.eye(3) - 0.5 * R.T @ R)
         cov[3:, 3:] += size**2 * 0.1 * np.eye(3)
         self.stamp_ns, self.step_cov = until_ns, self.step_cov + cov
