@@ -119,6 +119,12 @@ def topic_report(stream: TopicData, count: int) -> TopicReport:
     )
 
 
+def attitudes(quaternions: Array) -> NDArray[np.bool_]:
+    """Return (N,) which of the quaternions (N, 4) are attitudes: finite, and of about unit norm, as drivers write few digits."""
+    size = np.linalg.norm(quaternions, axis=1)
+    return np.asarray(np.isfinite(size) & (np.abs(size - 1.0) < 0.1))
+
+
 def sane(stream: TopicData, finite: slice | None = None) -> NDArray[np.intp]:
     """Return indices of messages with strictly increasing stamps, without clock jumps.
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
-from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, wrap_angle
+from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, wrap_angle, yaw_from_rotation
 from graphloc.frontends import _clock
-from graphloc.frontends._assess import Courses, MeasuredMotion, vec
+from graphloc.frontends._assess import Courses, MeasuredMotion, attitudes, vec
 from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
 from graphloc.frontends._reports import CompassReport, ImuReport, MountGuess, Vec
 from graphloc.frontends._sanity import (
@@ -486,11 +486,10 @@ def _yaws_beside(stamps: NDArray[np.int64], orientation: Array, evidence: ImuEvi
 
 def yaws_of(stamps: NDArray[np.int64], quaternions: Array) -> Yaws | None:
     """Return the stamps and yaws of unit quaternions (N, 4), at stamps (N,); None where half of them are invalid."""
-    whole = np.isfinite(quaternions).all(axis=1) & (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) < 0.1)
+    whole = attitudes(quaternions)
     if not len(whole) or whole.mean() <= 0.5:
         return None
-    x, y, z, w = quaternions[whole].T
-    return stamps[whole], np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return stamps[whole], yaw_from_rotation(np.asarray(Rotation.from_quat(quaternions[whole]).as_matrix()))
 
 
 def _units_of(imu: ImuSeries, beside: Mapping[str, Yaws]) -> _Units:

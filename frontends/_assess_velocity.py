@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation
-from graphloc.frontends._assess import MeasuredMotion, ReferenceTrack, motion_of_places, sane, track, vec
+from graphloc.frontends._assess import MeasuredMotion, ReferenceTrack, attitudes, motion_of_places, sane, track, vec
 from graphloc.frontends._assess_world import World
 from graphloc.frontends._reports import (
     BODY_AXES,
@@ -307,7 +307,7 @@ def motion_of_poses(poses: TopicData) -> MeasuredMotion | None:
     """Return the motion that poses tell, with the attitude if they have one; None of too few poses."""
     keep = sane(poses, np.s_[:3])
     q = poses.rows[keep, 3:7]
-    whole = np.isfinite(q).all(axis=1) & (np.abs(np.linalg.norm(q, axis=1) - 1.0) < 0.1)
+    whole = attitudes(q)
     told = bool(whole.mean() > 0.5) if len(whole) else False
     keep = keep[whole] if told else keep
     motion = motion_of_places(poses.topic, poses.stamps_ns[keep], poses.rows[keep, :3])

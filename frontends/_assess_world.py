@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array, Datum, Geodetic
-from graphloc.frontends._assess import ReferenceTrack, sane, vec
+from graphloc.frontends._assess import ReferenceTrack, attitudes, sane, vec
 from graphloc.frontends._reports import Vec
 from graphloc.frontends._streams import TopicData
 from graphloc.signals.series import interpolated
@@ -119,6 +119,4 @@ def world_of(poses: TopicData, fixes: ReferenceTrack, antenna_m: Array | None) -
 
 def _quaternions(rows: Array) -> Array:
     """Return valid quaternions (N, 4); invalid ones are replaced by the identity."""
-    size = np.linalg.norm(rows, axis=1)
-    good = np.isfinite(size) & (np.abs(size - 1.0) < 0.1)
-    return np.where(good[:, None], rows, [0.0, 0.0, 0.0, 1.0])
+    return np.where(attitudes(rows)[:, None], rows, [0.0, 0.0, 0.0, 1.0])
