@@ -73,7 +73,7 @@ class TagsSeen:
         self.body = np.vstack([self.R @ adjoint[3:], self.R @ adjoint[:3]])
         self.by_mount, self.by_late = np.eye(3), np.zeros(6)
         R_world_body = self.R @ m.R_body_camera.T
-        arm = self.p - at.carried_m - np.asarray(at.T_world_body.translation())
+        arm = at.T_world_body.rotation().matrix() @ np.asarray(T_state_camera.translation())
         off, late_s = self.slow[6 * self.rides :][:3], self.slow[6 * self.rides + 3 * self.mounted :][: int(self.timed)]
         if self.timed:
             rate = R_world_body @ at.gyro_radps

@@ -112,6 +112,7 @@ class Links:
     def forget(self, before_ns: int) -> None:
         """Drop the samples before a stamp, except the last of them and those that the bridge of a gap after it needs."""
         self._left_out = [gap for gap in self._left_out if gap[1] >= before_ns]
+        self._silent = self._silent[self._silent[:, 1] >= before_ns]
         before_ns = min([before_ns, *(a - duration_ns(_AROUND_S) for a, _ in self._left_out)])
         first = max(int(np.searchsorted(self._stamps, before_ns)) - 1, 0)
         self._stamps, self._samples = self._stamps[first:].copy(), self._samples[first:].copy()

@@ -451,8 +451,6 @@ def _no_velocity(value: Array) -> Rejection | None:
         return malformed("velocity is NaN")
     if np.abs(value).max() > MOST_SPEED_MPS:
         return malformed(f"velocity is beyond {MOST_SPEED_MPS:g} m/s")
-    if no_lock(value):
-        return rejected(f"it has no lock: a Doppler log's {NO_LOCK_MPS:g} m/s say so")
     return None
 
 
@@ -494,6 +492,8 @@ def _along(
     value = np.array(v_mps, dtype=float)[picked]
     if trouble := _no_velocity(value):
         return trouble
+    if no_lock(value):
+        return rejected(f"it has no lock: a Doppler log's {NO_LOCK_MPS:g} m/s say so")
     reported = cov[np.ix_(picked, picked)] if config.use_reported_sigma else np.zeros((len(axes), len(axes)))
     usable = usable_covariance(reported, np.full(len(axes), config.sigma_mps**2))
     return BodyVelocity(stamp_ns=stamp_ns, sensor=sensor, seq=seq, axes=axes, value=value, cov=usable)

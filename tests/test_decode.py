@@ -143,6 +143,8 @@ def test_velocity() -> None:
     np.testing.assert_allclose(v.cov_m2ps2, np.diag([0.04, 0.09, 0.16]))
     np.testing.assert_allclose(decode(MAKE.twist(T, (1, 2, 3)), VelocityConfig()).cov_m2ps2, 0.09 * np.eye(3))
     refused(MAKE.twist(T, (np.nan, 0, 0)), VelocityConfig(), Outcome.MALFORMED, "NaN")
+    # What a Doppler log writes without a lock is a speed to a receiver: that of a car.
+    np.testing.assert_allclose(decode(MAKE.twist(T, (32.768, 1, 0)), VelocityConfig()).v_enu_mps, [32.768, 1, 0])
 
 
 def test_velocity_in_north_east_down() -> None:
