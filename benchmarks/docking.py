@@ -25,13 +25,13 @@ from graphloc.eval.docking import tag_range_m
 from graphloc.eval.simulate import SimulatedRun, harbour_scenarios, simulate
 from graphloc.eval.simulate.bag import write_bag
 from graphloc.factors import INERTIAL, SENSORS
+from graphloc.judge.decide import Verdicts
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.recording import Recording
 from graphloc.solve import smooth
 from graphloc.solve._grow import grow
 from graphloc.solve._start import solve_start
 from graphloc.solve.alignment import align
-from graphloc.solve.decide import Verdicts
 from graphloc.time import stamps_of
 
 SEEDS = {"illuminated": range(2)}  # of a condition

@@ -23,12 +23,12 @@ from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Datum
 from graphloc.frontends.source import Bag
 from graphloc.gather import Gathering, LiveMatching, Scans, with_busy_warning
+from graphloc.judge.warnings import disagreement_warning, joint_rejection_warning
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement, TagSighting
 from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
 from graphloc.solution import Cause, Solution, SolveStats
-from graphloc.solve.warnings import disagreement_warning, joint_rejection_warning
 from graphloc.time import NS_PER_S, stamps_of
 from graphloc.trajectory import Trajectory
 

@@ -19,9 +19,9 @@ from graphloc.factors.apriltag import ROW, factors
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.tags.pose import modes_of, poses_of
 from graphloc.graph import Attachment, Decision
+from graphloc.judge.decide import by_hypotheses, predicted
 from graphloc.linear import Term, linear_update
 from graphloc.measurements import TagSighting
-from graphloc.solve.decide import by_hypotheses, predicted
 from graphloc.survey import Survey
 from tests.tagfactory import AHEAD, FACES_SOUTH, SIGMA, SIZE_M, UNIT, degrees_between, nearest_mode, rays_of
 

@@ -15,7 +15,7 @@ VOCABULARY = {
 }  # fmt: skip
 DOOR = {"__main__", "app", "cli", "drills", "found_tags", "gather", "replay", "stream", "job", "sweep", "ablations"}
 GRAPH = {
-    "graph", "inertial", "linear", "motion_model", "keys", "timeline", "build", "solve", "online", "origin", "outputs",
+    "graph", "inertial", "linear", "motion_model", "keys", "timeline", "build", "judge", "solve", "online", "origin", "outputs",
 }  # fmt: skip
 FORBIDDEN = {
     "facade": set[str](),  # graphloc/__init__.py imports its public names when they are first used
@@ -26,10 +26,11 @@ FORBIDDEN = {
     "eval": DOOR,
     "door": set[str](),
 }
-# The online mode judges and starts as `solve` does; nothing below knows it, and building knows no solver.
+# Both solvers judge by `judge`, and the online mode starts as `solve` does; nothing below knows it, and building knows no solver.
 ABOVE = {
-    **{name: {"build", "solve", "online"} for name in ("graph", "inertial", "linear", "keys", "timeline", "motion_model")},
-    "origin": {"solve", "online"}, "build": {"solve", "online"}, "solve": {"online"}, "outputs": {"build", "solve", "online"},
+    **{name: {"build", "judge", "solve", "online"} for name in ("graph", "inertial", "linear", "keys", "timeline", "motion_model")},
+    "origin": {"judge", "solve", "online"}, "build": {"judge", "solve", "online"}, "judge": {"solve", "online"},
+    "solve": {"online"}, "outputs": {"build", "judge", "solve", "online"},
 }  # fmt: skip
 
 
@@ -131,7 +132,7 @@ def test_declared_packages_are_those_on_disk() -> None:
     assert found == set(config["packages"])
 
 
-@pytest.mark.parametrize("folder", ["build", "solve", "online"])
+@pytest.mark.parametrize("folder", ["build", "judge", "solve", "online"])
 def test_each_module_of_the_solvers_has_a_place_on_the_map(folder: str) -> None:
     """Three of them had none: a reader who looks for what a file is for finds nothing."""
     said = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")

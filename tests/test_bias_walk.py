@@ -13,12 +13,12 @@ from graphloc import app
 from graphloc.config import ImuConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.frames import Array, wrap_angle
+from graphloc.judge.bias_walk import MOST_TIMES
 from graphloc.online._bias_walk import BiasWalk
 from graphloc.online._lag import Lag
 from graphloc.online._waiting import Waiting
 from graphloc.replay import replay
 from graphloc.solution import Solution
-from graphloc.solve.bias_walk import MOST_TIMES
 from tests.faults import arrivals_of, feed
 from tests.slowly import simulate_slowly
 from tests.test_online_faults import smoother

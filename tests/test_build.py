@@ -15,8 +15,8 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
+from graphloc.judge.covariances import world_covariance
 from graphloc.measurements import GnssVelocity
-from graphloc.solve.covariances import world_covariance
 
 LEVER_M = np.array([-5.0, 2.0, 2.0])
 GYRO_BIAS_RADPS = 0.05

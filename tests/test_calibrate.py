@@ -18,12 +18,12 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frontends.time_offsets import heading_time_offset
 from graphloc.frontends.turning import Turning
+from graphloc.judge.imu_noise import imu_misfit
+from graphloc.judge.linearised import normal_solver
 from graphloc.measurements import GnssVelocity, ImuSeries
 from graphloc.offsets import Misfit, Offset, Offsets, joined
 from graphloc.signals.imu_scatter import noise_density
 from graphloc.solve import smooth
-from graphloc.solve.imu_noise import imu_misfit
-from graphloc.solve.linearised import normal_solver
 from tests.bagfactory import Messages
 from tests.heldbags import read_recording
 from tests.slowly import simulate_slowly

@@ -10,13 +10,13 @@ from graphloc.build import Problem, StartPrior, build_graph, make_problem, state
 from graphloc.eval.simulate import find_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
+from graphloc.judge.decide import Stage, decisions, weigh
+from graphloc.judge.linearised import sparse_rows
 from graphloc.solve._grow import grow
 from graphloc.solve._marginals import marginals
 from graphloc.solve._start import solve_start
 from graphloc.solve.alignment import align
-from graphloc.solve.decide import Stage, decisions, weigh
 from graphloc.solve.imu_mount import by_turn
-from graphloc.solve.linearised import sparse_rows
 from graphloc.solve.stretch import past_at, solve_stretch, weak_prior
 from tests import tagfactory
 

@@ -13,13 +13,13 @@ from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import bl_scenario
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
+from graphloc.judge.best_chain import best_chain
+from graphloc.judge.decide import Verdict, by_hypotheses
+from graphloc.judge.hypotheses import FalseSequence
+from graphloc.judge.prediction import Prediction
+from graphloc.judge.warnings import joint_rejection_warning
 from graphloc.measurements import Measurement, PoseFix
 from graphloc.replay import replay
-from graphloc.solve.best_chain import best_chain
-from graphloc.solve.decide import Verdict, by_hypotheses
-from graphloc.solve.hypotheses import FalseSequence
-from graphloc.solve.prediction import Prediction
-from graphloc.solve.warnings import joint_rejection_warning
 from tests.slowly import simulate_slowly, sparsely
 
 SIGMA_M = 0.2

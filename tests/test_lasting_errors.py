@@ -28,12 +28,12 @@ from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.factors import KINDS, pose
 from graphloc.frames import Array, Datum
 from graphloc.graph import Decision
+from graphloc.judge.decide import Verdict
 from graphloc.measurements import Measurement, PoseFix
 from graphloc.online._snapshot import Snapshot
 from graphloc.replay import replay
 from graphloc.solution import Graded
 from graphloc.solve._lasting import lasting_error
-from graphloc.solve.decide import Verdict
 from graphloc.solve.warnings import _lasting_error
 from tests.faults import arrivals_of, feed
 from tests.slowly import simulate_slowly

@@ -32,11 +32,11 @@ from graphloc.frontends.decode import (
     usable_covariance,
     yaw_of_x_axis,
 )
+from graphloc.judge.covariances import world_covariance
 from graphloc.measurements import GnssPosition, ImuSeries, Measurement, PoseFix
 from graphloc.recording import Recording
 from graphloc.solve._standstill import Track
 from graphloc.solve.alignment import _position_and_velocity
-from graphloc.solve.covariances import world_covariance
 from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import Messages, still_run, write_bag

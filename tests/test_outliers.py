@@ -19,6 +19,7 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic, wrap_angle
 from graphloc.graph import Residual
+from graphloc.judge.decide import Stage, _by_kernel, weigh
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, Measurement, PoseFix
 from graphloc.online import OnlineSmoother
 from graphloc.online import _start as online_start
@@ -37,7 +38,6 @@ from graphloc.solve import _first_solution, _grow, batch
 from graphloc.solve._first_solution import first_solution
 from graphloc.solve._grow import grow
 from graphloc.solve._jumps import jumps_in, with_jumps_off_track
-from graphloc.solve.decide import Stage, _by_kernel, weigh
 from graphloc.solve.stretch import StretchStep, solve_stretch
 from tests.slowly import simulate_slowly, with_few_states
 

@@ -20,6 +20,7 @@ from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic
 from graphloc.graph import Residual
+from graphloc.judge.sensor_noise import Pair, Step, times_stated
 from graphloc.measurements import GnssPosition, Measurement, PoseFix
 from graphloc.online import OnlineSmoother
 from graphloc.online._noise import ImuNoise
@@ -29,7 +30,6 @@ from graphloc.online._sensor_noise import SensorNoise
 from graphloc.online._snapshot import Snapshot
 from graphloc.replay import arrivals, replay
 from graphloc.solve.batch import solve_batch
-from graphloc.solve.sensor_noise import Pair, Step, times_stated
 from graphloc.time import stamps_of
 from tests.faults import Fed, arrivals_of, feed
 from tests.slowly import simulate_slowly

@@ -15,19 +15,19 @@ from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import wrap_angle
+from graphloc.judge import imu_noise
+from graphloc.judge.decide import Stage, weigh
+from graphloc.judge.scatter import noisier_than_stated, white_scatter
 from graphloc.measurements import CompassHeading, Measurement, PoseFix
 from graphloc.recording import Recording, quiet
 from graphloc.replay import replay
 from graphloc.signals.imu_scatter import noise_density
 from graphloc.solution import Solution
-from graphloc.solve import imu_noise
 from graphloc.solve._passes import settle
 from graphloc.solve._solution import make_solution
 from graphloc.solve._start import solve_start
 from graphloc.solve.alignment import align
 from graphloc.solve.batch import BatchResult
-from graphloc.solve.decide import Stage, weigh
-from graphloc.solve.scatter import noisier_than_stated, white_scatter
 from graphloc.solve.stretch import unwound
 from tests.slowly import slowly
 

@@ -16,11 +16,11 @@ from graphloc.eval.report._health import cure, section
 from graphloc.eval.report._sections import _key_numbers
 from graphloc.eval.report._track_verdict import _late_velocity, main_table
 from graphloc.eval.simulate import Scenario, simulate
+from graphloc.judge.health import health_of
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import GnssPosition
 from graphloc.signals.frozen_receiver import FROZEN_FIX
 from graphloc.solution import Cause, Health, HealthReason, Solution
-from graphloc.solve.health import health_of
 from graphloc.trajectory import Trajectory
 
 

@@ -13,11 +13,11 @@ from graphloc.eval.simulate import Scenario, bl_scenario, simulate
 from graphloc.factors.gnss import ROW as GNSS
 from graphloc.frames import Datum
 from graphloc.graph import Decision, Residual, SlowProcess
+from graphloc.judge.decide import Verdict
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.online._entries import Entry
 from graphloc.online._live import LiveStream
 from graphloc.replay import replay
-from graphloc.solve.decide import Verdict
 from graphloc.time import NS_PER_S
 from tests.slowly import simulate_slowly
 

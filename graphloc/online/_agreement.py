@@ -10,11 +10,11 @@ import numpy as np
 from scipy.special import expit
 
 from graphloc.graph import Attachment
+from graphloc.judge.decide import AGREES, CREDIBLE, Verdict, far_sigmas
+from graphloc.judge.health import FAR_OFF
 from graphloc.measurements import Measurement
 from graphloc.online._live import LiveStream, LiveTimeline
 from graphloc.signals.position_jumps import MEAN_S
-from graphloc.solve.decide import AGREES, CREDIBLE, Verdict, far_sigmas
-from graphloc.solve.health import FAR_OFF
 
 _FEW = 8  # absolute measurements that must disagree before the estimate may be lost
 # Disagreement (s) after which the estimate is lost; measurements of one sensor that must disagree in a row by then.

@@ -19,8 +19,8 @@ from scipy.linalg import block_diag
 from graphloc.build import Judged
 from graphloc.frames import Array
 from graphloc.graph import Residual
-from graphloc.solve.hypotheses import log_false_again, log_right_and_false
-from graphloc.solve.prediction import taken_of
+from graphloc.judge.hypotheses import log_false_again, log_right_and_false
+from graphloc.judge.prediction import taken_of
 
 _MOST, _LEAST = 16, 12.0  # choices that are kept; log probability (nats) below the best at which one is dropped
 # Smallest eigenvalue of the information that remains when measurements are removed, as a share of their own. Their

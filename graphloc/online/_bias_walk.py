@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Walk of the IMU's biases (offline: `solve/bias_walk.py`).
+"""Walk of the IMU's biases (offline: `judge/bias_walk.py`).
 
 The walk is raised where a bias changes by more than its covariance and its configured walk allow. It is lowered again
 where the biases have changed clearly less for minutes, as when an IMU has warmed up.
@@ -14,9 +14,9 @@ import numpy as np
 from scipy.special import chdtr, chdtri
 
 from graphloc.inertial import InertialLink
+from graphloc.judge.bias_walk import MOST_TIMES, WALK_KEYS, KnownBias, too_steady, went_too_far
 from graphloc.measurements import ImuSeries
 from graphloc.online._lag import Lag
-from graphloc.solve.bias_walk import MOST_TIMES, WALK_KEYS, KnownBias, too_steady, went_too_far
 
 _EVERY_S = 10.0  # between two looks at the biases
 _RAISED_BY = 6  # looks by which the walk is raised: a minute. A bias that creeps shows only over the whole of it

@@ -17,10 +17,11 @@ from graphloc.build import constant_keys, never_revised, revisable
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import CONSTANT_TAILS, PLACE, Constant
+from graphloc.judge.health import FAR_OFF
+from graphloc.judge.warnings import far_off
 from graphloc.online._anchor import Anchor, ConditionalGaussian
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window
-from graphloc.solve.warnings import FAR_OFF, far_off
 
 _CHANGED = 0.05  # relative change of a prior's sigma from which the prior is replaced
 

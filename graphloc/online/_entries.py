@@ -13,14 +13,14 @@ import numpy as np
 from graphloc.build import attach
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Residual
+from graphloc.judge.decide import NEGLIGIBLE, Verdict, residuals_at
+from graphloc.judge.ledger import row_of
 from graphloc.ledger import LedgerRow
 from graphloc.linear import factors_of
 from graphloc.measurements import Measurement
 from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window, keys_of
-from graphloc.solve.decide import NEGLIGIBLE, Verdict, residuals_at
-from graphloc.solve.ledger import row_of
 
 _CHANGED = 0.1  # change of a weight (or relative change of a variance) from which the factors are replaced
 _MOVED_M, _TURNED_RAD = 0.1, 0.01  # distance and angle from the pose of linearisation, beyond which a factor is wrong

@@ -10,18 +10,18 @@ import numpy as np
 
 from graphloc.estimate import Estimate
 from graphloc.frames import Array
+from graphloc.judge.covariances import (
+    limit_heading,
+    widen_heading,
+    world_covariance,
+)
+from graphloc.judge.health import health_of, of_receivers
 from graphloc.online._anchor import sound
 from graphloc.online._lag import Lag
 from graphloc.online._odometry import Odometry
 from graphloc.online._propagate import Propagated
 from graphloc.online._unmodelled import UnmodelledError
 from graphloc.solution import Cause
-from graphloc.solve.covariances import (
-    limit_heading,
-    widen_heading,
-    world_covariance,
-)
-from graphloc.solve.health import health_of, of_receivers
 from graphloc.time import NS_PER_S
 
 

@@ -33,11 +33,11 @@ import gtsam
 import numpy as np
 
 from graphloc.frames import Array
+from graphloc.judge.covariances import world_covariance
 from graphloc.measurements import Measurement
 from graphloc.online._lag import Lag
 from graphloc.online._states import Newest
 from graphloc.signals.position_jumps import position_jumps
-from graphloc.solve.covariances import world_covariance
 from graphloc.time import stamps_of
 from graphloc.trajectory import bounds_95
 

@@ -20,6 +20,9 @@ from graphloc.config import KernelConfig
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual
+from graphloc.judge.best_chain import best_chain
+from graphloc.judge.decide import AGREES, Verdict, believing, by_hypotheses
+from graphloc.judge.hypotheses import log_evidence_of
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
 from graphloc.online._alternatives import Choice, choices
@@ -29,9 +32,6 @@ from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._receiver_checks import ReceiverChecks
 from graphloc.online._states import States
 from graphloc.online._window import Window
-from graphloc.solve.best_chain import best_chain
-from graphloc.solve.decide import AGREES, Verdict, believing, by_hypotheses
-from graphloc.solve.hypotheses import log_evidence_of
 
 _REJUDGE_AGES_S = (1.0, 4.0)  # ages at which a measurement with a kernel is judged again
 # How often an older group is judged again; weight from which a new one needs no second round

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from graphloc.build import noisier_imu
+from graphloc.judge.imu_noise import CONTRADICTION, LARGEST_NOISE_SCALE, LEAST_TIMES, noise_step, scattered, too_quiet
 from graphloc.measurements import ImuSeries
 from graphloc.online._bias_walk import BiasWalk
 from graphloc.online._lag import Lag
-from graphloc.solve.imu_noise import CONTRADICTION, LARGEST_NOISE_SCALE, LEAST_TIMES, noise_step, scattered, too_quiet
 
 _EVERY_S, _MISFITS = 5.0, 2  # how often the fit is checked, and how many checks in a row must fail
 _WINDOWS_S = 10.0  # how often a larger noise is tried; less often if the lag is longer

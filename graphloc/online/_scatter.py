@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""By what factor a sensor's residuals scatter more than it states, as they arrive (offline: `solve/scatter.py`)."""
+"""By what factor a sensor's residuals scatter more than it states, as they arrive (offline: `judge/scatter.py`)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from graphloc.chi2 import chi2_median
 from graphloc.frames import Array
-from graphloc.solve.scatter import GOLDEN, LAGS_S, SPARE, WHITE_S, noisier_than_stated
+from graphloc.judge.scatter import GOLDEN, LAGS_S, SPARE, WHITE_S, noisier_than_stated
 from graphloc.time import NS_PER_S
 
 _REMEMBERED = 300  # residuals that are remembered; as many pairs and second differences of them

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of fixes, poses and matches that scatter more than they state (offline: `solve/sensor_noise.py`)."""
+"""Noise of fixes, poses and matches that scatter more than they state (offline: `judge/sensor_noise.py`)."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Mapping
 
 from graphloc.config import SensorConfig
 from graphloc.graph import Residual
+from graphloc.judge.sensor_noise import Pair, pairs_of, times_stated
+from graphloc.judge.warnings import scale_warning
 from graphloc.measurements import Measurement
 from graphloc.online._lag import Lag
-from graphloc.solve.sensor_noise import Pair, pairs_of, times_stated
-from graphloc.solve.warnings import scale_warning
 from graphloc.time import duration_ns
 
 _EVERY_S = 5.0  # between two looks, to save time: a factor is told by a minute or more of pairs; a choice

@@ -21,6 +21,7 @@ from graphloc.estimate import Estimate, Event
 from graphloc.frames import Array, Datum
 from graphloc.graph import Sensor
 from graphloc.inertial import InertialRow
+from graphloc.judge.warnings import slow_error_warning
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement
 from graphloc.online._intake import ImuIntake, series_of
@@ -38,7 +39,6 @@ from graphloc.recording import Mounts
 from graphloc.signals.frozen_imu import FROZEN_IMU
 from graphloc.signals.imu_spikes import IMU_SPIKE
 from graphloc.signals.thinning import THINNED, Thinning
-from graphloc.solve.warnings import slow_error_warning
 from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from graphloc.errors import in_one_line
 from graphloc.frames import Array, Datum, Geodetic
+from graphloc.judge.imu_noise import LARGEST_NOISE_SCALE
 from graphloc.measurements import ImuSample
 from graphloc.online._anchor import Anchor
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import ErrorSizes
-from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE
 
 _VERSION = 11
 _EVERY_S = 2.0  # lost where the process is killed: short beside the 20 s for which an IMU gap is bridged; a choice

@@ -20,6 +20,10 @@ from graphloc import keys, origin
 from graphloc.build import Made, Problem, build_graph, company_of, make_problem
 from graphloc.errors import GraphlocError, SolveError
 from graphloc.frames import Array, Datum
+from graphloc.judge.covariances import ANY_HEADING_RAD, world_covariance
+from graphloc.judge.decide import AGREES, decisions
+from graphloc.judge.imu_noise import LARGEST_NOISE_SCALE
+from graphloc.judge.ledger import row_of
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
@@ -29,11 +33,7 @@ from graphloc.online._unmodelled import BeforeStart
 from graphloc.recording import Recording
 from graphloc.solve.alignment import wanted_travel_m
 from graphloc.solve.batch import BatchResult, solve_batch
-from graphloc.solve.covariances import ANY_HEADING_RAD, world_covariance
-from graphloc.solve.decide import AGREES, decisions
 from graphloc.solve.imu_mount import followed_before
-from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE
-from graphloc.solve.ledger import row_of
 from graphloc.solve.stretch import StretchStep, past_at
 from graphloc.solve.unmodelled import Unmodelled, unmodelled
 from graphloc.solve.warnings import noise_warnings

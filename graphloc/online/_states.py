@@ -16,14 +16,14 @@ from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import TIME_OFFSET, Attachment, Residual
 from graphloc.inertial import GapMotion, InertialLink
+from graphloc.judge.health import FAR_OFF
+from graphloc.judge.prediction import Prediction, prediction_of
+from graphloc.judge.warnings import late_far_off
 from graphloc.motion_model import UNSURE_MPS, Moving
 from graphloc.online._anchor import Anchor, in_world, without_priors
 from graphloc.online._constants import Constants
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window
-from graphloc.solve.health import FAR_OFF
-from graphloc.solve.prediction import Prediction, prediction_of
-from graphloc.solve.warnings import late_far_off
 from graphloc.time import NS_PER_S
 
 _HOLE_S = 1.0  # length of an IMU gap from which the motion model is not applied across it

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphloc.solve.covariances import ANY_HEADING_RAD
+from graphloc.judge.covariances import ANY_HEADING_RAD
 
 DOUBTFUL_RAD = np.radians(15.0)
 """1 sigma above which the heading counts as a guess: from such an error the window does not recover soon."""

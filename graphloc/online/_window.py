@@ -21,8 +21,8 @@ import numpy as np
 
 from graphloc.errors import SolveError, not_solved
 from graphloc.frames import Array
+from graphloc.judge.linearised import sparse_rows
 from graphloc.keys import is_leaf, is_pose
-from graphloc.solve.linearised import sparse_rows
 
 # Change of any tangent component (m, rad, m/s) from which a key is relinearised; millimetres from the batch
 _RELINEARIZE = 0.02

@@ -17,9 +17,7 @@ import numpy as np
 
 from graphloc.build import Decisions, Problem, StartPrior, Thinned, build_graph
 from graphloc.graph import Decision
-from graphloc.solve._marginals import Marginals, marginals
-from graphloc.solve._passes import SETTLED_M, SETTLED_WEIGHT, Settled, changed
-from graphloc.solve.decide import (
+from graphloc.judge.decide import (
     Stage,
     Verdict,
     Verdicts,
@@ -30,6 +28,8 @@ from graphloc.solve.decide import (
     predicted_by,
     weigh,
 )
+from graphloc.solve._marginals import Marginals, marginals
+from graphloc.solve._passes import SETTLED_M, SETTLED_WEIGHT, Settled, changed
 from graphloc.solve.stretch import copy_states, solve_until_written_there, update_states, weak_prior
 from graphloc.time import duration_ns
 

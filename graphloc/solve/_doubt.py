@@ -23,15 +23,15 @@ from graphloc.build import Decisions, Stream, Thinned, thinned
 from graphloc.chi2 import chi2_95
 from graphloc.frames import Array, wrap_angle
 from graphloc.graph import Attachment, FalseModel, Residual
+from graphloc.judge.covariances import world_covariance
+from graphloc.judge.decide import Verdict, decisions_on, met, predicted, predicted_by
+from graphloc.judge.hypotheses import log_right_and_false
+from graphloc.judge.prediction import taken_of
 from graphloc.measurements import Measurement
 from graphloc.signals.series import interpolated
 from graphloc.solution import Graded
 from graphloc.solve._choices import without
 from graphloc.solve.batch import BatchResult
-from graphloc.solve.covariances import world_covariance
-from graphloc.solve.decide import Verdict, decisions_on, met, predicted, predicted_by
-from graphloc.solve.hypotheses import log_right_and_false
-from graphloc.solve.prediction import taken_of
 from graphloc.time import stamps_of
 
 _SLIGHT = 0.005  # probability that is neglected: it widens bounds by 3 % at most

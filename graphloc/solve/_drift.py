@@ -20,8 +20,8 @@ from graphloc import keys
 from graphloc.build import Problem, solved_constants
 from graphloc.frames import Array
 from graphloc.graph import antenna_off_m, corrections
+from graphloc.judge.linearised import linearised, normal_solver, with_left_out
 from graphloc.solve.batch import BatchResult
-from graphloc.solve.linearised import linearised, normal_solver, with_left_out
 
 _LINEAR_RAD = np.radians(15.0)  # largest turn for which the linearised run holds
 

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import gtsam
 
 from graphloc.build import Problem, StartPrior, Thinned, thinned, with_sensor_noise
+from graphloc.judge.decide import Stage, Verdicts, weigh
+from graphloc.judge.sensor_noise import scattering
 from graphloc.recording import Progress
 from graphloc.solve._choices import other_choices, take_more_probable
 from graphloc.solve._passes import SETTLED_NATS, Settled, cost_without_outliers, expected_cost, settle
-from graphloc.solve.decide import Stage, Verdicts, weigh
-from graphloc.solve.sensor_noise import scattering
 
 MAX_SENSOR_ROUNDS = 2  # most times that the noise of sensors is raised
 # Most passes before and after other choices are tried. Before, they need not converge: what still changes then is a

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from graphloc.build import Problem, StartPrior, Stream, Thinned, bridged, thinned, with_usual_motion, without_sensor
 from graphloc.errors import SolveError
+from graphloc.judge.decide import AGREES, Stage, Verdicts, agrees, met
+from graphloc.judge.imu_noise import CONTRADICTION
 from graphloc.recording import Progress
 from graphloc.solve._final_passes import SolvedRun, as_they_scatter
 from graphloc.solve._grow import grow
 from graphloc.solve._passes import cost_as_configured, cost_of_run, rough_passes
 from graphloc.solve._start import Begun, solve_start
 from graphloc.solve.alignment import align
-from graphloc.solve.decide import AGREES, Stage, Verdicts, agrees, met
-from graphloc.solve.imu_noise import CONTRADICTION
 
 # Most passes over the thinned run after growing.
 _SEAM_PASSES = 2

@@ -9,11 +9,11 @@ import gtsam
 import numpy as np
 
 from graphloc.build import Past, Problem, StartPrior, without_imu
+from graphloc.judge.bias_walk import WALK_KEYS, BiasWanders, KnownBias, known_bias, went_too_far
+from graphloc.judge.decide import PredictedCovariance, Stage, Verdicts, agrees, decisions, predicted_by, weigh
 from graphloc.recording import Progress
 from graphloc.solve._marginals import marginals
 from graphloc.solve._passes import cost_as_configured
-from graphloc.solve.bias_walk import WALK_KEYS, BiasWanders, KnownBias, known_bias, went_too_far
-from graphloc.solve.decide import PredictedCovariance, Stage, Verdicts, agrees, decisions, predicted_by, weigh
 from graphloc.solve.stretch import (
     StretchStep,
     copy_states,

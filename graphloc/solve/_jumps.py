@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from graphloc.build import Problem, allowed_jump_m, jumping
+from graphloc.judge.decide import Verdicts
 from graphloc.signals.position_jumps import jumps_off_track
-from graphloc.solve.decide import Verdicts
 from graphloc.time import stamps_of
 
 

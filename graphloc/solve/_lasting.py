@@ -15,7 +15,7 @@ import numpy as np
 
 from graphloc.build import Stream
 from graphloc.frames import Array
-from graphloc.solve.decide import AGREES, Verdict
+from graphloc.judge.decide import AGREES, Verdict
 from graphloc.time import NS_PER_S, stamps_of
 
 _FEWEST = 30  # fewest positions: of fewer, only correlations of 0.7 and more are `_SURE` (4 / sqrt(30))

@@ -22,10 +22,10 @@ from graphloc.build import Problem, StartPrior, Stream, build_graph, jumping, st
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
+from graphloc.judge.decide import Stage, Verdicts, decisions, weigh
 from graphloc.recording import Progress
 from graphloc.signals.position_jumps import MEAN_S
 from graphloc.solve._passes import Settled, cost_of_run, settle
-from graphloc.solve.decide import Stage, Verdicts, decisions, weigh
 from graphloc.time import NS_PER_S, stamps_of
 
 _JUMP = 1.0  # least step from one node to the next that counts as a jump, sigmas: ten times the drift

@@ -33,10 +33,10 @@ from graphloc import keys
 from graphloc.build import Problem, StartPrior, Stream, with_imu_turned
 from graphloc.frames import Array
 from graphloc.graph import Constant, SlowProcess
+from graphloc.judge.imu_noise import imu_misfit
+from graphloc.judge.linearised import Rows, linearised, normal_solver, with_left_out
 from graphloc.offsets import Offset, Offsets, Probe
 from graphloc.solve.batch import BatchResult
-from graphloc.solve.imu_noise import imu_misfit
-from graphloc.solve.linearised import Rows, linearised, normal_solver, with_left_out
 
 BLOCK_S = 2.0  # length of a sum of residuals; `eval/calibrate` puts these together to 10 s, as errors last; a choice
 # Most rounds of choosing weights; they end earlier if the weights, or theta (in sigmas), change by less.

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import gtsam
 
 from graphloc.build import Made, Past, Problem, StartPrior, build_graph, cost_of_constants
+from graphloc.judge.decide import Stage, Verdicts, decisions, log_evidence, met, weigh
 from graphloc.recording import Progress
 from graphloc.solve._optimize import full_step, optimize
-from graphloc.solve.decide import Stage, Verdicts, decisions, log_evidence, met, weigh
 from graphloc.solve.stretch import moved, unwound
 
 SETTLED_M, SETTLED_WEIGHT = 0.03, 0.1

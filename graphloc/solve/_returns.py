@@ -16,11 +16,11 @@ import numpy as np
 
 from graphloc.build import Problem, Stream
 from graphloc.frames import Array
+from graphloc.judge.decide import Verdicts, far_sigmas, met
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.signals.position_jumps import MEAN_S
 from graphloc.solve._final_passes import RunChoice
 from graphloc.solve._levels import COMES_BACK_OFF, OUTAGE_S
-from graphloc.solve.decide import Verdicts, far_sigmas, met
 from graphloc.time import NS_PER_S, duration_ns, stamps_of, utc_text
 
 _CONVERGES_S = 60.0  # length of the time after an outage in which fixes are doubted

@@ -16,14 +16,7 @@ from graphloc.build import Problem, Stream, solved_constants
 from graphloc.errors import SolveError, in_one_line
 from graphloc.frames import Array
 from graphloc.graph import TIME_OFFSET, antenna_off_m, corrections
-from graphloc.recording import Recording
-from graphloc.signals.series import interpolated
-from graphloc.solution import SlowEstimate, Solution
-from graphloc.solve._doubt import widen_by_doubt
-from graphloc.solve._drift import with_drift_taken_back
-from graphloc.solve._marginals import marginals
-from graphloc.solve.batch import BatchResult
-from graphloc.solve.covariances import (
+from graphloc.judge.covariances import (
     ANY_HEADING_RAD,
     limit_heading,
     to_world,
@@ -31,9 +24,17 @@ from graphloc.solve.covariances import (
     widen_heading,
     world_covariance,
 )
-from graphloc.solve.health import health_over_time, late_of, misfits, of_receivers, since_agreed
+from graphloc.judge.health import late_of, of_receivers
+from graphloc.judge.ledger import ledger_of
+from graphloc.recording import Recording
+from graphloc.signals.series import interpolated
+from graphloc.solution import SlowEstimate, Solution
+from graphloc.solve._doubt import widen_by_doubt
+from graphloc.solve._drift import with_drift_taken_back
+from graphloc.solve._health import health_over_time, misfits, since_agreed
+from graphloc.solve._marginals import marginals
+from graphloc.solve.batch import BatchResult
 from graphloc.solve.imu_mount import mount_error
-from graphloc.solve.ledger import ledger_of
 from graphloc.solve.unmodelled import unmodelled
 from graphloc.solve.warnings import mount_event, mount_warning, stats_of
 from graphloc.trajectory import Trajectory

@@ -21,11 +21,11 @@ from graphloc import keys
 from graphloc.build import Problem, StartPrior
 from graphloc.errors import SolveError
 from graphloc.frames import Array, wrap_angle
+from graphloc.judge.decide import Stage, cost_of_noise, decisions, weigh
 from graphloc.recording import Progress, quiet
 from graphloc.solve._grow import grow
 from graphloc.solve._passes import expected_cost
 from graphloc.solve.alignment import Start, start_pose
-from graphloc.solve.decide import Stage, cost_of_noise, decisions, weigh
 from graphloc.solve.stretch import copy_states, dead_reckon, fill_slow, solve_stretch
 from graphloc.time import duration_ns
 

@@ -32,6 +32,10 @@ import numpy as np
 from graphloc.build import Problem, StartPrior, bridged, thinned, with_imu_scaled, with_noise_scale, with_sensor_noise
 from graphloc.errors import SolveError
 from graphloc.frames import Array
+from graphloc.judge.bias_walk import BiasWanders, with_needed_walk
+from graphloc.judge.decide import Stage, Verdicts
+from graphloc.judge.imu_noise import CONTRADICTION, noise_step, with_needed_noise
+from graphloc.judge.sensor_noise import scattering
 from graphloc.recording import Progress, quiet
 from graphloc.solve._final_passes import LAST_PASSES, MAX_SENSOR_ROUNDS, SolvedRun, as_they_scatter
 from graphloc.solve._first_solution import first_solution
@@ -41,11 +45,7 @@ from graphloc.solve._marginals import marginals
 from graphloc.solve._passes import cost_of_run, cost_without_outliers, rough_passes
 from graphloc.solve._returns import doubtful_returns
 from graphloc.solve._start import Begun
-from graphloc.solve.bias_walk import BiasWanders, with_needed_walk
-from graphloc.solve.decide import Stage, Verdicts
 from graphloc.solve.imu_mount import MountError, with_mount_estimated
-from graphloc.solve.imu_noise import CONTRADICTION, noise_step, with_needed_noise
-from graphloc.solve.sensor_noise import scattering
 
 _MAX_NOISE_ROUNDS, _MAX_JUMP_ROUNDS, _MAX_WALK_ROUNDS = 4, 2, 3
 # Nats by which each jump must make a run more probable. To say at which of a thousand fixes it is, and to which of a

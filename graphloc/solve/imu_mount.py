@@ -31,10 +31,10 @@ from graphloc import keys
 from graphloc.build import Problem, StartPrior, with_imu_turned
 from graphloc.errors import SolveError
 from graphloc.frames import Array, skew
+from graphloc.judge.decide import Stage, Verdicts, weigh
+from graphloc.judge.linearised import linearised, normal_solver, sparse_rows, with_left_out
 from graphloc.recording import Progress
 from graphloc.solve._passes import Settled, cost_of_run, settle
-from graphloc.solve.decide import Stage, Verdicts, weigh
-from graphloc.solve.linearised import linearised, normal_solver, sparse_rows, with_left_out
 
 # Most rounds of turning the IMU and solving again; they end where what is left is below `_MATTERS`; a choice.
 _ROUNDS = 3

@@ -19,9 +19,9 @@ from graphloc import keys
 from graphloc.build import Stream
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
+from graphloc.judge.covariances import untold_errors
+from graphloc.judge.linearised import linearised, normal_solver
 from graphloc.solve.batch import BatchResult
-from graphloc.solve.covariances import untold_errors
-from graphloc.solve.linearised import linearised, normal_solver
 from graphloc.time import NS_PER_S
 
 _DRAWS, _AT_ONCE = 64, 16  # a sigma from 64 draws is good to 9 %; so many at once, for memory

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from graphloc.build import Past, Problem, StartPrior, without_imu
 from graphloc.errors import SolveError
 from graphloc.frames import Array
+from graphloc.judge.decide import agrees, met
 from graphloc.ledger import Outcome
 from graphloc.recording import Recording
 from graphloc.solve._passes import cost_as_configured
-from graphloc.solve.decide import agrees, met
 from graphloc.solve.stretch import copy_states, dead_reckon
 from graphloc.time import NS_PER_S, duration_ns, utc_text
 

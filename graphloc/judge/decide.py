@@ -24,10 +24,10 @@ from graphloc.chi2 import chi2_95
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision, Residual, SlowProcess
-from graphloc.solve.best_chain import best_chain
-from graphloc.solve.hypotheses import log_evidence_of, sequence_of
-from graphloc.solve.prediction import Prediction, predict_residuals, prediction_of
-from graphloc.solve.scatter import noisier_than_stated, scatter_of, scatter_of_pairs, white_scatter
+from graphloc.judge.best_chain import best_chain
+from graphloc.judge.hypotheses import log_evidence_of, sequence_of
+from graphloc.judge.prediction import Prediction, predict_residuals, prediction_of
+from graphloc.judge.scatter import noisier_than_stated, scatter_of, scatter_of_pairs, white_scatter
 
 
 class Stage(enum.StrEnum):

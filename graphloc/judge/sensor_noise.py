@@ -18,8 +18,8 @@ import numpy as np
 from graphloc.build import Judged, Problem
 from graphloc.frames import Array
 from graphloc.graph import Residual
+from graphloc.judge.decide import Verdicts
 from graphloc.measurements import Measurement
-from graphloc.solve.decide import Verdicts
 
 _PAIRED_S = 10.0  # longest time between the two of a pair: over longer, the error of the estimate changes, too
 _FEWEST, _MOST = 15, 2000  # pairs: with fewer, nothing is said; more are not used

@@ -18,7 +18,7 @@ from graphloc.build import JUMP, Decided, Made, Problem, StartPrior, Stream, bui
 from graphloc.config import KernelConfig
 from graphloc.frames import Array
 from graphloc.graph import Attachment, Decision
-from graphloc.solve.decide import Verdicts
+from graphloc.judge.decide import Verdicts
 
 _LEAST_WEIGHT = 1e-6  # as for a linear factor (`linear.linear_update`), so that no row vanishes
 

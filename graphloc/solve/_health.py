@@ -1,50 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Health: how far each pose can be trusted, and why not fully."""
+"""Health of each pose of a solved run, by what came before and comes after."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import reduce
-from typing import Any
+from collections.abc import Sequence
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from graphloc import keys
 from graphloc.build import Problem, Stream
-from graphloc.config import VesselConfig
 from graphloc.frames import Array
+from graphloc.judge.decide import AGREES, CREDIBLE, Verdict, far_sigmas
+from graphloc.judge.health import FAR_OFF, health_of, late_of, why_late, why_unlikely
+from graphloc.judge.imu_noise import LARGEST_NOISE_SCALE
 from graphloc.signals.position_jumps import LASTS_S, why_in_doubt
-from graphloc.solution import CONTRADICTING_COST, LOST_BOUND_M, Cause, Health, HealthReason, SolveStats
+from graphloc.solution import CONTRADICTING_COST, Health, HealthReason, SolveStats
 from graphloc.solve.batch import BatchResult
-from graphloc.solve.decide import AGREES, CREDIBLE, Verdict, far_sigmas
-from graphloc.solve.imu_noise import LARGEST_NOISE_SCALE
 from graphloc.time import duration_ns
-from graphloc.trajectory import Trajectory, bounds_95
-
-_LOST_HEADING_DEG = 45.0  # 95 % bound beyond which a heading helps nobody
-_DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
-
-FAR_OFF = 3.0
-"""Sigmas from its setting beyond which an estimate is said to be far off."""
-
-
-def late_of(stream: Stream, values: gtsam.Values) -> float | None:
-    """Return how much later than stamped a sensor measures, s; None where its slow state does not estimate that."""
-    if stream.slow is None or (axis := stream.slow.late) is None:
-        return None
-    return float(values.atVector(keys.slow(stream.number, 0))[axis])
-
-
-def why_late(sensor: str) -> str:
-    """Return the reason why no pose is good beside a sensor whose stamps are far off."""
-    return f"the stamps of {sensor} are far off what stamp_sigma_s allows for"
-
-
-def why_unlikely(sensor: str) -> str:
-    """Return the reason why no pose is good beside a sensor that agrees only by an unlikely large slow error."""
-    return f"{sensor} agrees only by more than {FAR_OFF:g} sigmas of its slow error: it contradicts the others"
+from graphloc.trajectory import Trajectory
 
 
 def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[str]:
@@ -128,20 +101,6 @@ def since_agreed(problem: Problem, stream: Stream, verdicts: dict[tuple[int, int
     return np.where(left >= 0, (stamps - agreed[np.maximum(left, 0)]) * 1e-9, np.inf)
 
 
-def of_receivers(since: Mapping[str, Any], config: VesselConfig) -> dict[str, Any]:
-    """Return, by absolute sensor, how long its receiver has not agreed, s, numbers or arrays.
-
-    Sensors that read one receiver by turns count as one.
-
-    Args:
-        since: by sensor, how long it has not agreed, s.
-    """
-    alike = {name: config.by_turns(name) for name in since}
-    return {
-        name: reduce(np.minimum, (since[other] for other in others if other in since)) for name, others in alike.items()
-    }
-
-
 def _or_until(since: Array, stamps_ns: NDArray[np.int64]) -> Array:
     """Return the seconds since a sensor agreed, or, before that, until it first does: a smoother knows what comes."""
     known = np.flatnonzero(np.isfinite(since))
@@ -166,32 +125,3 @@ def health_over_time(
         for k, cov in enumerate(trajectory.cov)
     ]
     return tuple(health for health, _ in found), tuple(why for _, why in found)
-
-
-def health_of(
-    cov: Array, away_s: Mapping[str, float], good_bound_m: float, misfit: str = ""
-) -> tuple[Health, HealthReason]:
-    """Return how far a pose can be trusted, and why not fully.
-
-    Args:
-        cov: (6, 6) as in `Trajectory`. away_s: s to where each absolute sensor agrees.
-        good_bound_m: `output.good_bound_m`. misfit: what else speaks against the pose.
-    """
-    bound_m, _, heading_deg = (float(v) for v in bounds_95(cov[None])[0])
-    silent = [name for name, s in away_s.items() if s > _SILENT_S]
-    if bound_m > LOST_BOUND_M:
-        return Health.LOST, HealthReason(f"95 % bound {bound_m:.0f} m, heading {heading_deg:.0f} deg", Cause.BOUND)
-    if heading_deg > _LOST_HEADING_DEG:
-        said = f"heading unknown: 95 % bound {heading_deg:.0f} deg; that of the position {bound_m:.1f} m"
-        return Health.LOST, HealthReason(said, Cause.HEADING)
-    if min(away_s.values(), default=np.inf) > _DEAD_RECKONING_S:
-        return Health.DEAD_RECKONING, HealthReason("no absolute position agrees", Cause.NO_POSITION)
-    if bound_m > good_bound_m:
-        return Health.DEGRADED, HealthReason(f"95 % bound {bound_m:.1f} m", Cause.BOUND)
-    if silent:
-        return Health.DEGRADED, HealthReason(
-            f"{', '.join(silent)} missing or not agreeing", Cause.SENSORS, tuple(silent)
-        )
-    if misfit:
-        return Health.DEGRADED, HealthReason(misfit, Cause.CONTRADICTION)
-    return Health.GOOD, HealthReason()

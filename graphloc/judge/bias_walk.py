@@ -20,9 +20,9 @@ from graphloc import keys
 from graphloc.build import Past, Problem, StartPrior, with_imu_scaled
 from graphloc.frames import Array
 from graphloc.inertial import InertialLink
-from graphloc.solve.decide import Verdicts
-from graphloc.solve.imu_noise import components, squares_and_freedom
-from graphloc.solve.linearised import linearised, normal_solver
+from graphloc.judge.decide import Verdicts
+from graphloc.judge.imu_noise import components, squares_and_freedom
+from graphloc.judge.linearised import linearised, normal_solver
 from graphloc.time import NS_PER_S
 
 WANDERS_S = 60.0

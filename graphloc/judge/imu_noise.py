@@ -18,11 +18,11 @@ from scipy.special import chdtr, chdtrc
 
 from graphloc.build import Problem, StartPrior, with_imu_noise
 from graphloc.frames import Array
+from graphloc.judge.decide import Verdicts
+from graphloc.judge.linearised import linearised, normal_solver, normal_solver_and_log_det
 from graphloc.measurements import ImuSeries
 from graphloc.offsets import Misfit
 from graphloc.signals.imu_scatter import noise_density
-from graphloc.solve.decide import Verdicts
-from graphloc.solve.linearised import linearised, normal_solver, normal_solver_and_log_det
 
 Solved = tuple[Any, Array, Callable[[Array], Array]]
 """J, weighted; residuals (rows,); and a function of y that solves J'J x = y."""

@@ -22,7 +22,7 @@ from graphloc import gauss
 from graphloc.build import Judged
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
-from graphloc.solve.prediction import PredictedResidual, Prediction, moved, taken_of
+from graphloc.judge.prediction import PredictedResidual, Prediction, moved, taken_of
 
 
 @dataclass(frozen=True, slots=True)

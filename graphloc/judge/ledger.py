@@ -6,10 +6,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from graphloc.build import Judged, Problem
+from graphloc.judge.decide import AGREES, Verdict
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import Measurement
 from graphloc.recording import Recording
-from graphloc.solve.decide import AGREES, Verdict
 
 _FALSE = 0.05  # a measurement that is right with less probability is rejected, not just down-weighted
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from graphloc.build import Judged
 from graphloc.frames import Array
 from graphloc.graph import FalseModel, Residual
-from graphloc.solve.hypotheses import log_false_again
-from graphloc.solve.prediction import Prediction, carried, kept_of, moved, taken_of, walk_of
+from graphloc.judge.hypotheses import log_false_again
+from graphloc.judge.prediction import Prediction, carried, kept_of, moved, taken_of, walk_of
 from graphloc.time import stamps_of
 
 _LOOK_BACK = 64  # measurements before one, among which the right one before it is looked for
