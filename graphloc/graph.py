@@ -453,6 +453,11 @@ class Sensor:
     in_world: bool = False
     along_body: bool = False
 
+    @property
+    def has_hypotheses(self) -> bool:
+        """Whether each measurement is right or false; else the robust loss alone limits what a wrong one does."""
+        return self.false is not None
+
     def of(self, config: SensorConfig) -> Sensor:
         """Return the row as it holds for a configuration: poses that give only height or heading are neither `absolute` nor `company`."""
         return self if config.tells_place else replace(self, absolute=False, company=False)

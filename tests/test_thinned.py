@@ -96,7 +96,7 @@ def test_a_state_a_second_at_least_and_all_that_measurements_want() -> None:
     assert np.diff(few.problem.timeline.stamps_ns).max() <= 1.1e9
     for stream, thin in zip(problem.streams, few.problem.streams, strict=True):
         nodes = problem.timeline.slow_of[stream.state]
-        if stream.row.false is None:  # one for each node, the first
+        if not stream.row.has_hypotheses:  # one for each node, the first
             assert few.chosen[stream.number].tolist() == [int(np.argmax(nodes == j)) for j in np.unique(nodes)]
         else:
             assert len(thin.measurements) == len(stream.measurements)

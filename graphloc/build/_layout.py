@@ -280,7 +280,7 @@ def _with_jumps(
     jumps = _NO_JUMPS
     # Sensors that read one receiver by turns (with and without RTK) have slow errors that are told apart, but none of
     # these sensors holds the place while another one jumps.
-    if alone and (slow is None or config.takes_turns) and row.absolute and row.false is None:
+    if alone and (slow is None or config.takes_turns) and row.absolute and not row.has_hypotheses:
         jumps = _position_jumps(row, measurements, datum, allowed_jump_m(left_out or slow))
     if left_out is not None and len(jumps[0]):
         slow, left_out = without_drift(left_out), None

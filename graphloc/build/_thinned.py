@@ -82,7 +82,7 @@ def thinned(problem: Problem) -> Thinned:
 
 def _chosen(problem: Problem, stream: Stream) -> NDArray[np.int64]:
     """Return the indices of the measurements of a stream that are kept."""
-    if stream.row.false is not None:
+    if stream.row.has_hypotheses:
         return np.arange(len(stream.measurements))
     return np.flatnonzero(np.diff(problem.timeline.slow_of[stream.state], prepend=-1) > 0)
 

@@ -137,7 +137,7 @@ def weigh(
     """
     verdicts: Verdicts = {}
     for stream in problem.streams:
-        several = stream.row.false is not None
+        several = stream.row.has_hypotheses
         if only is not None and not several:
             continue
         indices = [i for i in stream.between(first, last) if only is None or (stream.number, i) in only]
@@ -184,7 +184,7 @@ def _by_kernel(
     # bend the motion until the solver diverges; weighted by how far they are off, the other sensors hold it together.
     # Fixes keep their weight, as they lead back; and so do measurements that share an error (a mount), which has to
     # give way.
-    by_scatter = stage is Stage.FAR and stream.row.false is not None and not stream.constants
+    by_scatter = stage is Stage.FAR and stream.row.has_hypotheses and not stream.constants
     noisier = times if by_scatter else noisier_than_stated(white)
     scale = min(own.scale * times / noisier * float(np.sqrt(dof)), _WIDEST)
     kernel = KernelConfig(kind=own.kind if gentle else limit.kind, scale=scale)
@@ -251,7 +251,7 @@ def agrees(stream: Stream, residual: Residual) -> bool:
     For a sensor with hypotheses: whether it is within the 95 % quantile of chi-square.
     """
     nis, dof = residual.nis(), len(residual.raw)
-    if stream.row.false is not None:
+    if stream.row.has_hypotheses:
         return nis < chi2_95(dof)
     return stream.config.kernel.weight(nis / dof) >= AGREES
 
@@ -271,7 +271,7 @@ def log_evidence(problem: Problem, values: gtsam.Values, first: int, last: int) 
     """
     total = 0.0
     for stream in problem.streams:
-        if stream.row.false is not None:
+        if stream.row.has_hypotheses:
             indices = stream.between(first, last)
             residuals = [residuals_at(problem, stream, i, values)[1] for i in indices]
             total += log_evidence_of(stream, indices, residuals)
@@ -282,7 +282,7 @@ def along_best_chains(problem: Problem, values: gtsam.Values, verdicts: Verdicts
     """Return the verdicts that believe each sensor's most probable chain, however far from the estimate."""
     changed = dict(verdicts)
     for stream in problem.streams:
-        if stream.row.false is None:
+        if not stream.row.has_hypotheses:
             continue
         every = range(len(stream.measurements))
         attached, residuals = met(problem, stream, every, values)

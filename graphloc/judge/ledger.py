@@ -39,11 +39,11 @@ def row_of(stream: Judged, m: Measurement, topic: str, verdict: Verdict) -> Ledg
         outcome, reason = Outcome.USED, ""
     elif verdict.reason:
         outcome, reason = Outcome.REJECTED, verdict.reason
-    elif stream.row.false is not None and weight < _FALSE:
+    elif stream.row.has_hypotheses and weight < _FALSE:
         outcome, reason = Outcome.REJECTED, "judged false: no mode agrees with the rest"
     else:
         outcome, reason = Outcome.DOWN_WEIGHTED, "disagrees with the rest"
-    several = stream.row.false is not None
+    several = stream.row.has_hypotheses
     return LedgerRow(
         seq=m.seq,
         stamp_ns=m.stamp_ns,

@@ -202,7 +202,7 @@ class Entries:
         """
         for entry in self._all_reachable():
             row = entry.stream.row
-            bound = row.false is not None or (row.absolute and entry.linear)
+            bound = row.has_hypotheses or (row.absolute and entry.linear)
             if bound and entry.held is not None and stale(entry):
                 self._write(entry)
 

@@ -128,7 +128,7 @@ class HeadingCheck:
         if (
             stream is None
             or not stream.row.absolute
-            or stream.row.false is not None
+            or stream.row.has_hypotheses
             or stream.frozen_detector.frozen
             or self._sensor not in ("", m.sensor)
         ):

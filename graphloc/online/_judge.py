@@ -103,7 +103,7 @@ class Judge:
             self._entries.add(Entry(stream, i, Verdict.false(residuals[0], at, why)))
             if stream.receiver.jump.suspects(m.stamp_ns):
                 self.denials.note(stream.name, m.stamp_ns, residuals[0].nis(), agrees=False, outlier=False)
-        elif stream.row.false is None:
+        elif not stream.row.has_hypotheses:
             verdict, widened = self._by_kernel(stream, i, at, residuals[0], fresh=True)
             # With a widened kernel it is used, but whether it agrees shows only when it is judged again.
             if not widened or verdict.weight < AGREES:
@@ -127,7 +127,7 @@ class Judge:
                 unsettled = self._by_hypotheses(stream, self._group(stream))
                 if rounds > 1 and unsettled:
                     self._rounds[name] = rounds - 1
-            elif stream.row.false is not None and now_s >= self._rejudged_s.get(name, 0.0) + _OLDER_EVERY_S:
+            elif stream.row.has_hypotheses and now_s >= self._rejudged_s.get(name, 0.0) + _OLDER_EVERY_S:
                 self._rejudge_older(stream, now_s)
                 if name in self._others:
                     self._unsure.add(name)

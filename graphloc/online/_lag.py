@@ -325,9 +325,9 @@ class Lag:
         for stream in map(self.problem.streams.__getitem__, sensors):
             own = [e for e in self._entries.of(stream) if e.measurement.stamp_ns >= since_ns]
             share = sum(e.verdict.weight >= AGREES for e in own) / max(len(own), 1)
-            if stream.row.false is None and share < _EXPLAINED:
+            if not stream.row.has_hypotheses and share < _EXPLAINED:
                 return False
-            agreeing += share >= (_EXPLAINED if stream.row.false is None else _HALF)
+            agreeing += share >= (_HALF if stream.row.has_hypotheses else _EXPLAINED)
         lasts_s = (self.newest.stamp_ns - since_ns) * 1e-9
         return agreeing >= 2 and 2.0 * self._states.steps_cost(since_ns) <= most_motion(lasts_s)
 

@@ -50,7 +50,7 @@ class ReceiverChecks:
         It is left out if it repeats an old fix or velocity, is of a frozen receiver, or may begin a jump. Once a jump
         is found, the window is rebuilt with the fixes since its beginning.
         """
-        if stream.row.false is not None:
+        if stream.row.has_hypotheses:
             return ""
         hint = stream.row.hint(m, 0.0, self._problem.datum)
         if np.isfinite(hint.v_world_mps).all():

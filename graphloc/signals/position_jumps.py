@@ -61,7 +61,7 @@ def only_position_sensor(stream: Any, absolute: Collection[Any]) -> bool:
     Args:
         absolute: the streams of the run that measure position.
     """
-    alone = len(absolute) == 1 and stream.row.absolute and stream.row.false is None
+    alone = len(absolute) == 1 and stream.row.absolute and not stream.row.has_hypotheses
     return bool(alone and (stream.slow is None or stream.left_out is not None or stream.slow.jumps))
 
 

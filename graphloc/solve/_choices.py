@@ -66,7 +66,7 @@ def _judged_by_the_rest(few: Thinned, settled: Settled, prior: StartPrior) -> tu
     at_s = {  # time of each hypothesis in the run
         (s.number, i): (m.stamp_ns - start_ns) * 1e-9
         for s in problem.streams
-        if s.row.false is not None
+        if s.row.has_hypotheses
         for i, m in enumerate(s.measurements)
     }
     judged, everything, iterations = dict(settled.verdicts), decisions_on(few, settled.verdicts, values), 0
@@ -103,7 +103,7 @@ def _without_its_ends(problem: Problem, settled: Settled) -> Verdicts:
     """
     others = dict(settled.verdicts)
     for stream in problem.streams:
-        if stream.row.false is None or not stream.measurements:
+        if not stream.row.has_hypotheses or not stream.measurements:
             continue
         stamps = [m.stamp_ns for m in stream.measurements]
         for end_ns in (stamps[0], stamps[-1]):
@@ -213,7 +213,7 @@ def _solve_around(
             return None
         if step.moved_m < SETTLED_M and changed(used, verdicts) < SETTLED_WEIGHT:
             break
-    numbers = {s.number for s in problem.streams if s.row.false is not None}
+    numbers = {s.number for s in problem.streams if s.row.has_hypotheses}
     plain = decisions(verdicts, {key for key in verdicts if key[0] in numbers})
     graph, guess = build_graph(problem, local, plain, first, last, prior)
     return _Around(local, verdicts, float(graph.error(guess)) - log_evidence(problem, local, first, last))

@@ -133,7 +133,7 @@ def ambiguity(sensor: str, aspect: str, probability: Array) -> list[str]:
 
 def _shares_errors(stream: Stream) -> bool:
     """Return whether a sensor's measurements can be false, and some may share the error of the one before them."""
-    return stream.row.false is not None and any(model.news < 1.0 for model in _judged(stream)[1])
+    return stream.row.has_hypotheses and any(model.news < 1.0 for model in _judged(stream)[1])
 
 
 def _judged(stream: Stream) -> tuple[list[Measurement], list[FalseModel]]:

@@ -78,7 +78,7 @@ def _doubted(problem: Problem, solved: SolvedRun) -> list[Stream]:
     return [
         stream
         for stream in problem.streams
-        if stream.row.false is None
+        if not stream.row.has_hypotheses
         and not stream.row.absolute
         and (contradicted or _off_for_long(_off(stream, verdicts)))
     ]
@@ -142,7 +142,7 @@ def _begun_without_a_sensor(problem: Problem, few: Thinned, begun: Begun, progre
 
     lowest, best, iterations = -CLEARLY, None, begun.iterations
     for stream in few.problem.streams:
-        if stream.row.absolute or stream.row.false is not None or not stream.measurements:
+        if stream.row.absolute or stream.row.has_hypotheses or not stream.measurements:
             continue
         whole = next(s for s in problem.streams if s.number == stream.number)
         rest, window_s = without_sensor(few.problem, stream), problem.config.start.window_s

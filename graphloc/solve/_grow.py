@@ -163,7 +163,7 @@ def _solve_grown(window: GrownWindow) -> tuple[int, StretchStep, Verdicts]:
 
 def _fresh(problem: Problem, known: int, last: int) -> set[tuple[int, int]]:
     """Return the measurements of sensors with hypotheses that are new in a window."""
-    return {(s.number, i) for s in problem.streams if s.row.false is not None for i in s.between(known + 1, last)}
+    return {(s.number, i) for s in problem.streams if s.row.has_hypotheses for i in s.between(known + 1, last)}
 
 
 def _solve_without(window: GrownWindow, fresh: Container[tuple[int, int]]) -> tuple[StretchStep, Verdicts, int]:
@@ -212,7 +212,7 @@ def _solve_without(window: GrownWindow, fresh: Container[tuple[int, int]]) -> tu
 
 def _agree(problem: Problem, verdicts: Verdicts) -> bool:
     """Return whether most measurements of each sensor without hypotheses agree, by its loss as wide as configured."""
-    by_loss = {stream.number: stream for stream in problem.streams if stream.row.false is None}
+    by_loss = {stream.number: stream for stream in problem.streams if not stream.row.has_hypotheses}
     agree: dict[int, list[bool]] = {number: [] for number in by_loss}
     for (number, _), verdict in verdicts.items():
         if (stream := by_loss.get(number)) is not None:

@@ -25,7 +25,7 @@ def with_jumps_off_track(problem: Problem, verdicts: Verdicts) -> Problem | None
         verdicts: of the solution, on each measurement.
     """
     absolute = [s for s in problem.streams if s.row.absolute]
-    if len(absolute) != 1 or absolute[0].row.false is not None:
+    if len(absolute) != 1 or absolute[0].row.has_hypotheses:
         return None
     (stream,) = absolute
     known_ns, _ = stream.position_jumps

@@ -217,7 +217,7 @@ def cost_as_configured(
     # A `Past` has the priors of the constants that it knows.
     cost += cost_of_constants(problem, values, prior.known if isinstance(prior, Past) else ())
     for stream in problem.streams:
-        if stream.row.false is None:
+        if not stream.row.has_hypotheses:
             _, residuals = met(problem, stream, stream.between(first, last), values)
             cost += sum(min(stream.config.kernel.loss(r.nis(), len(r.raw)) for r in found) for found in residuals)
     return cost

@@ -134,7 +134,7 @@ def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Retu
         misfit: of the solution: if it is as large everywhere, a cost after an outage tells nothing.
     """
     absolute = [s for s in problem.streams if s.row.absolute]
-    if len(absolute) != 1 or absolute[0].row.false is not None or len(absolute[0].position_jumps[0]):
+    if len(absolute) != 1 or absolute[0].row.has_hypotheses or len(absolute[0].position_jumps[0]):
         return None
     (stream,) = absolute
     cost = _costs(stream, solved.verdicts)

@@ -102,7 +102,7 @@ def _written_anew(problem: Problem, values: gtsam.Values, first: int, last: int,
     """Return the decisions of a stretch, those of sensors with hypotheses attached at the present estimate."""
     written = dict(decided)
     for stream in problem.streams:
-        if stream.row.false is not None:
+        if stream.row.has_hypotheses:
             for i in stream.between(first, last):
                 if (found := decided.get((stream.number, i))) is not None:
                     written[stream.number, i] = Decided(found.decision, attach(problem, stream, i, values))

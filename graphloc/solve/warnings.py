@@ -98,7 +98,7 @@ def _turned_mount(stream: Stream, result: BatchResult) -> list[str]:
 
 def _noisier(stream: Stream, result: BatchResult) -> float:
     """Return how many times its stated noise a sensor with a kernel is taken to have."""
-    if stream.row.false is not None:
+    if stream.row.has_hypotheses:
         return 1.0
     found = [result.verdicts[stream.number, i].decision for i in range(len(stream.measurements))]
     return max((decision.weight**-0.5 for decision in found if decision is not None), default=1.0)
