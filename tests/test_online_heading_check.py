@@ -17,7 +17,7 @@ from graphloc.factors import gnss, imu
 from graphloc.frames import Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.measurements import CompassHeading, GnssPosition
 from graphloc.online._frozen_receiver import FrozenReceiverDetector
-from graphloc.online._heading_check import HeadingCheck, _lever_m
+from graphloc.online._heading_check import HeadingCheck, _lever_m, first_of
 from graphloc.online._live import ReceiverDetectors
 from graphloc.recording import Recording
 from graphloc.replay import Replayed, replay
@@ -215,6 +215,25 @@ def test_a_wrong_heading_is_not_laid_to_fixes_that_are_later_than_stamps_are(in_
 def test_a_wrong_heading_is_found_after_the_clock_was_set_back(at_two_hertz: SimulatedRun) -> None:
     an_hour_ahead_ns = int(at_two_hertz.truth.stamps_ns[0]) + 3600 * SECOND
     assert len(said_of(at_two_hertz, (0.0, 0.0), np.radians(70.0), an_hour_ahead_ns)) == 1
+
+
+def test_the_fit_of_the_first_unknown_holds_also_where_it_hardly_shows() -> None:
+    """By the inverse of the information; and where it is nearly as the others, which that inverse cannot tell from being one of them."""
+    rng = np.random.default_rng(4)
+    design, observed = (rng.normal(size=(2, *size)).T @ [1.0, 1j] for size in ((3, 40), (40,)))
+    priors, sigma = np.array([0.1, 20.0]), 0.3
+    information = design.conj().T @ design / sigma**2 + np.diag([0.0, *priors**-2.0])
+    expected = np.linalg.solve(information, design.conj().T @ observed / sigma**2)[0]
+    fit = first_of(design, observed, sigma, priors)
+    assert fit is not None
+    assert fit.rho == pytest.approx(expected)
+    assert fit.sigma == pytest.approx(np.sqrt(np.linalg.inv(information)[0, 0].real))
+    apart, *others = np.linalg.qr(design)[0].T
+    faint = first_of(np.column_stack([others[0] + 1e-9 * apart, *others]), observed, sigma, np.full(2, 1e12))
+    assert faint is not None
+    assert faint.rho * 1e-9 == pytest.approx(apart.conj() @ observed, rel=1e-5)
+    assert faint.sigma * 1e-9 == pytest.approx(sigma, rel=1e-5)
+    assert first_of(design * [0.0, 1.0, 1.0], observed, sigma, priors) is None
 
 
 def test_an_antenna_swings_about_the_imu_by_its_distance_from_there() -> None:

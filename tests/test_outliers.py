@@ -139,7 +139,9 @@ def test_gentle_losses_are_tried_where_a_sensor_disagrees_not_where_dead_reckoni
 @pytest.mark.parametrize("off", [0.5, 20.0])
 def test_a_sensor_agrees_by_its_loss_as_configured_not_as_widened(off: float) -> None:
     config = SimpleNamespace(kernel=KernelConfig(kind="cauchy", scale=1.5))
-    problem: Any = SimpleNamespace(streams=[SimpleNamespace(number=3, row=SimpleNamespace(has_hypotheses=False), config=config)])
+    problem: Any = SimpleNamespace(
+        streams=[SimpleNamespace(number=3, row=SimpleNamespace(has_hypotheses=False), config=config)]
+    )
     residual = Residual(
         raw=np.full(1, off), cov=np.eye(1), jacobian=lambda: np.zeros((1, 6)), prior=1.0, size_m=None, size_deg=None
     )

@@ -251,11 +251,8 @@ class HeadingCheck:
         observed, design = columns[:, 0], columns[:, 1:]
         residual = observed - design @ np.linalg.lstsq(design, observed, rcond=None)[0]
         independent = _WINDOW_S / _APART_S  # fixes closer together share their errors
-        variance = float(np.mean(np.abs(residual) ** 2)) * len(observed) / independent
-        information = design.conj().T @ design / variance + np.diag([0.0, *(1.0 / prior_sigmas**2)])
-        rho = complex(np.linalg.solve(information, design.conj().T @ observed / variance)[0])
-        sigma = float(np.sqrt(np.linalg.inv(information)[0, 0].real))
-        return Fit(rho, sigma)
+        sigma_m = float(np.sqrt(np.mean(np.abs(residual) ** 2) * len(observed) / independent))
+        return first_of(design, observed, sigma_m, prior_sigmas)
 
     def _reckoned(self, lag: Lag, newest: Newest, drift_radps: Array, place_m: float) -> tuple[Array, Array]:
         """Dead-reckon the antenna by the steps of the IMU, from rest.
@@ -285,6 +282,24 @@ class HeadingCheck:
         ahead_thrice = np.cumsum(ahead_twice * step_s)
         at_s = (np.array([step.until_ns for step in self._steps]) - newest.stamp_ns) * 1e-9
         return at_s, np.array([reckoned, ahead_twice, ahead_thrice, *([ahead] if place_m else [])])
+
+
+def first_of(design: Array, observed: Array, sigma: float, prior_sigmas: Array) -> Fit | None:
+    """Return the first of some unknowns by least squares; None if nothing shows it.
+
+    By QR: on a vessel at rest the normal equations are so ill-conditioned that a variance can come out negative.
+
+    Args:
+        design, observed: (M, N), (M,) complex. sigma: of each row.
+        prior_sigmas: (N - 1,) of the other unknowns, about zero; the first has no prior.
+    """
+    others = np.diag(1.0 / prior_sigmas).astype(complex)
+    rows = np.vstack([design[:, 1:], sigma * others])
+    q, r = np.linalg.qr(np.column_stack([rows, np.append(design[:, 0], np.zeros(len(others)))]))
+    shown = abs(r[-1, -1])
+    if not shown > 0.0:
+        return None
+    return Fit(complex(q[: len(observed), -1].conj() @ observed / r[-1, -1]), sigma / float(shown))
 
 
 def _mount_m(lag: Lag, receiver: str) -> Array:
