@@ -32,24 +32,24 @@ def _to_local(at: Attachment) -> Array:
     return at.datum.local_axes(at.body_m).T
 
 
-def _predicted_mps(at: Attachment, config: VelocityConfig) -> Array:
+def _predicted_mps(at: Attachment, config: VelocityConfig, to_local: Array) -> Array:
     """Return the predicted velocity (3,), without white noise: east, north, up."""
     late, off = late_and_off(at, config)
     v = at.sensor_velocity_mps(off)
     if late:
         v = v + at.sensor_acceleration_mps2(off) * late
-    v = _to_local(at) @ v
+    v = to_local @ v
     return v if at.slow_value is None else v - at.slow_value
 
 
-def _attitude_jacobian(at: Attachment, config: VelocityConfig) -> Array:
+def _attitude_jacobian(at: Attachment, config: VelocityConfig, to_local: Array) -> Array:
     """Return d z / d (body tangent of the state's pose: theta, rho), (3, 6)."""
     late, off = late_and_off(at, config)
     turned = at.swing_mps(off) + (at.pushed_mps2(off) * late if late else 0.0)
-    return np.hstack([-_to_local(at) @ at.T_world_body.rotation().matrix() @ skew(turned), np.zeros((3, 3))])
+    return np.hstack([-to_local @ at.T_world_body.rotation().matrix() @ skew(turned), np.zeros((3, 3))])
 
 
-def _by_constants(at: Attachment, config: VelocityConfig) -> tuple[Array, ...]:
+def _by_constants(at: Attachment, config: VelocityConfig, to_local: Array) -> tuple[Array, ...]:
     """Return the derivative (3, k) of the velocity by tau and o, as far as they are estimated."""
     if not at.constants:
         return ()
@@ -60,18 +60,19 @@ def _by_constants(at: Attachment, config: VelocityConfig) -> tuple[Array, ...]:
         if late and at.felt is not None:
             swing = swing + late * (skew(at.felt.spin_radps2) + swing @ swing)
         columns.append(at.T_world_body.rotation().matrix() @ swing @ at.T_state_sensor.rotation().matrix())
-    return (_to_local(at) @ np.hstack(columns),) if columns else ()
+    return (to_local @ np.hstack(columns),) if columns else ()
 
 
 def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[Residual, ...]:
     """Return predicted - measured (3,), m/s: east, north, up."""
+    to_local = _to_local(at)
     plain = Residual(
-        raw=_predicted_mps(at, config) - m.v_enu_mps,
+        raw=_predicted_mps(at, config, to_local) - m.v_enu_mps,
         cov=with_floors(m.cov_m2ps2, config.min_sigma_mps**2),
-        jacobian=lambda: _attitude_jacobian(at, config),
-        velocity_jacobian=lambda: _to_local(at),
+        jacobian=lambda: _attitude_jacobian(at, config, to_local),
+        velocity_jacobian=lambda: to_local,
         slow_jacobian=lambda: -np.eye(3),
-        constant_jacobians=lambda: _by_constants(at, config),
+        constant_jacobians=lambda: _by_constants(at, config, to_local),
         prior=1.0,
         size_m=None,
         size_deg=None,
@@ -99,7 +100,7 @@ def ideal(at: Attachment, config: VelocityConfig) -> GnssVelocity:
         stamp_ns=0,
         sensor="gnss_velocity",
         seq=0,
-        v_enu_mps=_predicted_mps(at, config),
+        v_enu_mps=_predicted_mps(at, config, _to_local(at)),
         cov_m2ps2=np.eye(3) * 0.01,
     )
 

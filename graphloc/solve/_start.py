@@ -92,14 +92,16 @@ def solve_start(
                 # leads.
                 candidate.prior = _start_prior(problem, start, _first_yaw(candidate.values))
         best, beside = candidates[0], list[float]()
-        if start.by_motion and told_apart:
-            beside = _costs_beside(problem, start, best, until)
+        asked = start.by_motion and told_apart
+        if asked:
+            beside = _costs_beside(problem, start, best, until, until)
             told_apart = beside[-1] > _excluded(best)
         if told_apart or last_window:
             heading_var = np.zeros(until + 1)
             if start.by_motion:
-                last_var = 0.0 if told_apart else _var_at(problem, start, best, until, until, beside)
-                first_var = last_var if newest else _var_at(problem, start, best, until, 0)
+                last_var = _var_at(problem, start, best, until, until, beside)
+                beside = _costs_beside(problem, start, best, until, 0) if asked and not newest else []
+                first_var = last_var if newest else _var_at(problem, start, best, until, 0, beside)
                 stamps = problem.timeline.stamps_ns[: until + 1]
                 heading_var = np.interp(stamps, stamps[[0, -1]], (first_var, last_var))
             return Begun(best.values, best.prior, until, iterations, len(candidates), heading_var, start, best.excess)
@@ -206,22 +208,24 @@ def _excluded(best: _Candidate) -> float:
     return best.cost + _COST_APART * best.excess
 
 
-def _costs_beside(problem: Problem, start: Start, best: _Candidate, last: int) -> list[float]:
-    """Return the costs of headings at state `last` beside the best one, up to the first that is not excluded."""
+def _costs_beside(problem: Problem, start: Start, best: _Candidate, last: int, at: int) -> list[float]:
+    """Return the costs of headings of state `at` beside the best one, up to the first that is not excluded."""
     costs: list[float] = []
     for by_rad in _OTHERS_RAD[:2].tolist():
-        costs.append(_held(problem, start, best, last, last, by_rad).cost)
+        costs.append(_held(problem, start, best, last, at, by_rad).cost)
         if costs[-1] <= _excluded(best):
             break
     return costs
 
 
-def _var_at(problem: Problem, start: Start, best: _Candidate, last: int, at: int, known: Sequence[float] = ()) -> float:
-    """Return the variance, rad^2, of the heading of state `at`, from what other headings cost: near 0 if much more.
+def _var_at(problem: Problem, start: Start, best: _Candidate, last: int, at: int, known: Sequence[float]) -> float:
+    """Return the variance, rad^2, of the heading of state `at`, from what other headings cost; 0 if those beside it are excluded.
 
     Args:
-        known: costs of the first of the other headings, where they are known.
+        known: of `_costs_beside`; empty where farther headings may cost less than those beside it.
     """
+    if known and known[-1] > _excluded(best):
+        return 0.0
     others = [_held(problem, start, best, last, at, by_rad).cost for by_rad in _OTHERS_RAD[len(known) :].tolist()]
     cost = np.array([*known, *others])
     weight = _WIDTHS_RAD * np.exp(-np.maximum(cost - best.cost, 0.0) / best.excess)
