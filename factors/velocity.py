@@ -77,7 +77,7 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
         size_m=None,
         size_deg=None,
     )
-    return (walked(plain, at.walked()),)
+    return (plain if at.slow_walk is None else walked(plain, at.walked()),)
 
 
 def slow(config: VelocityConfig) -> SlowProcess | None:
