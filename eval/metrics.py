@@ -24,7 +24,7 @@ from graphloc.plain import aligned
 from graphloc.recording import SpeedSeries
 from graphloc.signals.series import interpolated, rms
 from graphloc.solution import SlowEstimate
-from graphloc.time import stamps_of
+from graphloc.time import stamps_of, utc_text
 from graphloc.trajectory import Trajectory
 
 Levers = Mapping[str, Array]
@@ -115,8 +115,15 @@ def common_stamps(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.i
     """
     covered = estimate.covers(truth.stamps_ns)
     if not covered.any():
-        raise NoCommonTimeError("the track and the truth share no time: check the stamps of truth_topic")
+        raise NoCommonTimeError(
+            f"the track ({_when(estimate)}) and the truth ({_when(truth)}) share no time: check the stamps of truth_topic, and "
+            "truth_time_offset_s"
+        )
     return truth.stamps_ns[covered], float(covered.mean())
+
+
+def _when(track: Trajectory) -> str:
+    return " to ".join(utc_text(int(stamp)) for stamp in track.stamps_ns[[0, -1]])
 
 
 def errors(estimate: Trajectory, truth: Trajectory) -> TrackErrors:

@@ -81,7 +81,12 @@ def truth_statement(run: Run) -> str:
             f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; their own noise is part "
             f"of the error{drift}.{beside} The track in this folder lacks them: for the best track run again without --hold-out."
         )
-    said = "No truth and no held-out fixes: nothing here measures accuracy"
+    none = (
+        "No truth"
+        if run.config.truth_topic is None
+        else f"No truth ({run.config.truth_topic} cannot be used: see the warnings)"
+    )
+    said = f"{none} and no held-out fixes: nothing here measures accuracy"
     by = suggested(run.recording.of(GnssPosition))
     return f"{said}. `graphloc compare --hold-out {by}` does." if by else f"{said}; a `truth_topic` would."
 

@@ -96,6 +96,8 @@ class VesselConfig(Block):
     """Sensors by name; `kind` in each block selects the sensor kind."""
     truth_topic: str | None = None
     """Topic with the true body pose in world (`nav_msgs/Odometry`, `geometry_msgs/PoseStamped`, `PoseWithCovarianceStamped`, `TransformStamped`), for comparisons only; never fused."""
+    truth_time_offset_s: Annotated[float, Field(ge=-4e9, le=4e9)] = 0.0
+    """Added to the stamps of the truth, s: -18 for one in GPS time beside sensors in UTC."""
     check_speed_topic: str | None = None
     """`nav_msgs/Odometry` whose forward speed is compared with the solution's; never fused."""
     timeline: TimelineConfig = TimelineConfig()
