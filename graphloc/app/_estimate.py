@@ -117,7 +117,7 @@ def smooth_recording(
     online, never = None, ""
     if compare:
         filters = _filters(recording, config, datum, progress)
-        online, never = _online(recording, config, datum, progress)
+        online, never = _online(recording, config, datum, solution, progress)
     if online is not None:
         beside = ekf.FilterResult(name=online.name, trajectory=online.trajectory, ledger=online.ledger)
         filters = (beside, *filters)
@@ -228,12 +228,13 @@ def _track_warnings(
 
 
 def _online(
-    recording: Recording, config: VesselConfig, datum: Datum, progress: Progress
+    recording: Recording, config: VesselConfig, datum: Datum, offline: Solution, progress: Progress
 ) -> tuple[Solution | None, str]:
-    """Return what the online mode makes of it, or why it made nothing."""
+    """Return what the online mode makes of it, or why it made nothing; its events are timed as the report of both is: by the offline track."""
+    begin_ns = int(offline.trajectory.stamps_ns[0])
     status = lambda at_s, whole_s, *_: progress("online", int(at_s), int(whole_s))
     try:
-        return replay(recording, config, datum=datum, status=status).solution, ""
+        return replay(recording, config, datum=datum, begin_ns=begin_ns, status=status).solution, ""
     except SolveError as error:
         return None, f"graphloc online is not compared: {error}"
 
