@@ -21,7 +21,7 @@ from graphloc.eval.tag_check import suspect_tags
 from graphloc.eval.underlay import underlay
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Datum
-from graphloc.frontends.aerial import Match, match_bag
+from graphloc.frontends.aerial import Match, check_bag, match_bag
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.part import Bags
 from graphloc.gather import Matches, Scans, with_matches, with_sightings, with_surveys
@@ -108,6 +108,10 @@ def smooth_recording(
     datum = choose_datum(recording, config)
     recording = with_synthetic(recording, config, datum)
     matched = scans is not None and bool(config.of_kind("aerial"))
+    for sensor in config.of_kind("aerial").values() if scans is not None else ():
+        check_bag(
+            scans.bags, sensor, scans.folder, config.body_frame, datum
+        )  # not after the minutes of the first solution
     solution = solve(recording, config, datum, probe=None if matched else calibrate.PROBE, progress=progress)
     pictures: tuple[tuple[str, bytes], ...] = ()
     if scans is not None and matched:
@@ -309,6 +313,7 @@ def match_at(
         raise InputError("no sensor of kind aerial is enabled: set `enabled: true` in its block")
     (sensor, *_) = _matched_alone(config).of_kind("aerial").values()
     datum = choose_datum(recording, config)
+    check_bag(scans.bags, sensor, scans.folder, config.body_frame, datum)
     whole = with_synthetic(recording, config, datum)
     track = solve(whole, config, datum, progress=progress).trajectory
     span_s = (int(track.stamps_ns[-1]) - int(track.stamps_ns[0])) / 1e9
