@@ -356,9 +356,13 @@ def held_out_table(
         slow: by name of the estimate, its slow errors as for `compare_to_held_out`.
     """
     rows = [(name, compare_to_held_out(t, held, datum, antennas.of(name), slow.get(name))) for name, t in estimates]
-    return _table(
-        "Against held-out fixes", rows, "the fixes' own noise is part of the error; gaps lack GNSS velocities, too"
-    )
+    note = "the fixes' own noise is part of the error; gaps lack GNSS velocities, too"
+    kept = {name for name, row in rows if row.fix_rmse_m is not None}
+    if kept and len(kept) < len(rows):  # a row of dashes but for one
+        note += (
+            f"; fix_rmse_m takes off the receiver's slow error over time, which only {' and '.join(sorted(kept))} keeps"
+        )
+    return _table("Against held-out fixes", rows, note)
 
 
 def speed_table(estimates: _Named, check: SpeedSeries, switched_off: str = "") -> Table:

@@ -79,6 +79,7 @@ def test_a_draft_from_inspect_gives_a_track(
     assert "guess" in draft.read_text()
     assert called(monkeypatch, "smooth", where, "-c", draft, "-o", tmp_path / "run", "--json") == 0
     printed = capsys.readouterr().out
+    assert f"<h1>{where.name}</h1>" in (tmp_path / "run" / "report.html").read_text()  # not 'run: run.bag'
     truth = json.loads(printed[printed.index('{\n  "Against') : printed.rindex("}") + 1])["Against truth"]["graphloc"]
     assert truth["position_rmse_m"] < 3.0
     assert truth["heading_rmse_deg"] < 6.0

@@ -239,6 +239,7 @@ def test_a_track_apart_from_a_drifting_receiver_predicts_its_fixes() -> None:
         {"ours": {"gnss": drift}},
     )
     assert [row["fix_rmse_m"] for row in table.as_dict().values()] == [pytest.approx(1.0, abs=1e-6), None]
+    assert table.note.endswith("; fix_rmse_m takes off the receiver's slow error over time, which only ours keeps")
 
 
 def test_forward_speed_by_hand() -> None:

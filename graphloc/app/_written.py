@@ -91,10 +91,16 @@ def truth_statement(run: Run) -> str:
     return f"{said}. `graphloc compare --hold-out {by}` does." if by else f"{said}; a `truth_topic` would."
 
 
+def _titled(vessel: str, source: str) -> str:
+    """Return what a report is headed with; `inspect` names a vessel after its bag, and one name is enough then."""
+    bag = source.partition(", ")[0]
+    return source if vessel in (bag, Path(bag).stem) else f"{vessel}: {source}"
+
+
 def report_data(run: Run, command: str = "") -> report.ReportData:
     """Return what the report of a run shows."""
     return report.ReportData(
-        title=f"{run.config.vessel}: {Path(run.recording.source).name}",
+        title=_titled(run.config.vessel, Path(run.recording.source).name),
         solution=run.solution,
         recording=run.recording,
         config=run.config,
