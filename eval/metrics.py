@@ -47,11 +47,16 @@ class Table:
         """Return the values by name of row and column."""
         return {name: dict(zip(self.columns, values, strict=True)) for name, values in self.rows}
 
+    def told(self) -> list[tuple[str, tuple[float | None, ...]]]:
+        """Return each column with its values, by row; without those that have none."""
+        values = zip(*(values for _, values in self.rows), strict=True)
+        told = zip(self.columns, values, strict=True)
+        return [(column, found) for column, found in told if any(value is not None for value in found)]
+
     def as_text(self) -> str:
         """Return the table as aligned text with a column per estimate, so that it fits a terminal."""
-        numbers = [[number(vs[k]) for _, vs in self.rows] for k in range(len(self.columns))]
         cells = [["", *(name for name, _ in self.rows)]]
-        cells += [[column, *values] for column, values in zip(self.columns, numbers, strict=True)]
+        cells += [[column, *map(number, values)] for column, values in self.told()]
         return "\n".join([self.title, *aligned(cells, numbers=True), *([self.note] if self.note else [])])
 
 

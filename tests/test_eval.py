@@ -239,6 +239,11 @@ def test_a_track_apart_from_a_drifting_receiver_predicts_its_fixes() -> None:
         {"ours": {"gnss": drift}},
     )
     assert [row["fix_rmse_m"] for row in table.as_dict().values()] == [pytest.approx(1.0, abs=1e-6), None]
+    lines = table.as_text().splitlines()
+    assert any(line.split() == ["fix_rmse_m", "1.000", "-"] for line in lines)
+    untold = metrics.held_out_table([("ours", track)], held, datum, metrics.Antennas(configured=levers), {})
+    assert "fix_rmse_m" not in untold.as_text()  # a row of dashes alone
+    assert untold.as_dict()["ours"]["fix_rmse_m"] is None
     assert table.note.endswith("; fix_rmse_m takes off the receiver's slow error over time, which only ours keeps")
 
 
