@@ -24,6 +24,7 @@ from graphloc.frames import Datum
 from graphloc.frontends.aerial import Match, check_bag, match_bag
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.part import Bags
+from graphloc.frontends.tum import read_tum
 from graphloc.gather import Matches, Scans, with_matches, with_sightings, with_surveys
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.offsets import Probe
@@ -34,6 +35,7 @@ from graphloc.signals.frozen_receiver import without_frozen_fixes
 from graphloc.solution import Solution
 from graphloc.solve import smooth
 from graphloc.time import NS_PER_S, duration_ns
+from graphloc.trajectory import Trajectory
 
 _MOST_GROWN = 8  # times that scans are matched around what those within reach lead to: each carries it on for some 20 s
 _GAINS = 0.9  # of those beyond reach, that may be left for it to be worth its time
@@ -61,7 +63,19 @@ def load(
     """Read a vessel.yaml, some of its keys changed (`config.with_changes`), and the bag, or the part of it, that it describes."""
     config = configured(config_path, changes)
     recording = read_recording(bags, config, progress)
+    if config.truth_file:
+        recording = replace(recording, truth=_truth_of_file(Path(config_path).parent, config, recording))
     return with_sightings(recording, config, bags, progress), config
+
+
+def _truth_of_file(folder: Path, config: VesselConfig, recording: Recording) -> Trajectory:
+    """Return the truth that a file holds; of a part of a bag, what lies within the part."""
+    truth = read_tum(folder / config.truth_file, config.truth_time_offset_s)
+    if recording.span is None or recording.imu is None or not len(recording.imu):
+        return truth
+    first_ns, *_, last_ns = recording.imu.stamps_ns
+    inside = (truth.stamps_ns >= first_ns) & (truth.stamps_ns <= last_ns)
+    return truth.where(inside) if inside.sum() > 1 else truth
 
 
 def online_smoother(
@@ -108,10 +122,9 @@ def smooth_recording(
     datum = choose_datum(recording, config)
     recording = with_synthetic(recording, config, datum)
     matched = scans is not None and bool(config.of_kind("aerial"))
-    for sensor in config.of_kind("aerial").values() if scans is not None else ():
-        check_bag(
-            scans.bags, sensor, scans.folder, config.body_frame, datum
-        )  # not after the minutes of the first solution
+    if scans is not None:  # not after the minutes of the first solution
+        for sensor in config.of_kind("aerial").values():
+            check_bag(scans.bags, sensor, scans.folder, config.body_frame, datum)
     solution = solve(recording, config, datum, probe=None if matched else calibrate.PROBE, progress=progress)
     pictures: tuple[tuple[str, bytes], ...] = ()
     if scans is not None and matched:

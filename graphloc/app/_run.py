@@ -43,7 +43,7 @@ def made_comparable(run: Run) -> Run:
     truth, speed, held, track = run.recording.truth, run.recording.check_speed, run.held, run.solution.trajectory
     said: list[str] = []
     if truth is not None and (apart := clock_apart(track, truth)) is not None:
-        said.append(apart.said(run.config.truth_topic or "truth", run.config.truth_time_offset_s))
+        said.append(apart.said(run.config.truth or "truth", run.config.truth_time_offset_s))
 
     def comparable(compare: Callable[..., object], *arguments: object) -> bool:
         try:

@@ -57,7 +57,7 @@ def truth_statement(run: Run) -> str:
     if run.recording.truth is not None:
         truth = run.recording.truth
         span_s = (int(truth.stamps_ns[-1]) - int(truth.stamps_ns[0])) / 1e9
-        named = run.config.truth_topic or "given with the recording"
+        named = run.config.truth or "given with the recording"
         imu = run.recording.imu
         begun = bool(run.filters) and imu is not None and bool(truth.covers(imu.stamps_ns[:1]).all())
         started = " The EKFs are started at it, as BL started theirs; graphloc is not." if begun else ""
@@ -81,11 +81,7 @@ def truth_statement(run: Run) -> str:
             f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; their own noise is part "
             f"of the error{drift}.{beside} The track in this folder lacks them: for the best track run again without --hold-out."
         )
-    none = (
-        "No truth"
-        if run.config.truth_topic is None
-        else f"No truth ({run.config.truth_topic} cannot be used: see the warnings)"
-    )
+    none = "No truth" if not run.config.truth else f"No truth ({run.config.truth} cannot be used: see the warnings)"
     said = f"{none} and no held-out fixes: nothing here measures accuracy"
     by = suggested(run.recording.of(GnssPosition))
     return f"{said}. `graphloc compare --hold-out {by}` does." if by else f"{said}; a `truth_topic` would."
