@@ -24,7 +24,7 @@ from graphloc.plain import aligned
 from graphloc.recording import SpeedSeries
 from graphloc.signals.series import interpolated, rms
 from graphloc.solution import SlowEstimate
-from graphloc.time import stamps_of
+from graphloc.time import stamps_of, utc_text
 from graphloc.trajectory import Trajectory
 
 Levers = Mapping[str, Array]
@@ -47,11 +47,16 @@ class Table:
         """Return the values by name of row and column."""
         return {name: dict(zip(self.columns, values, strict=True)) for name, values in self.rows}
 
+    def told(self) -> list[tuple[str, tuple[float | None, ...]]]:
+        """Return each column with its values, by row; without those that have none."""
+        values = zip(*(values for _, values in self.rows), strict=True)
+        told = zip(self.columns, values, strict=True)
+        return [(column, found) for column, found in told if any(value is not None for value in found)]
+
     def as_text(self) -> str:
         """Return the table as aligned text with a column per estimate, so that it fits a terminal."""
-        numbers = [[number(vs[k]) for _, vs in self.rows] for k in range(len(self.columns))]
         cells = [["", *(name for name, _ in self.rows)]]
-        cells += [[column, *values] for column, values in zip(self.columns, numbers, strict=True)]
+        cells += [[column, *map(number, values)] for column, values in self.told()]
         return "\n".join([self.title, *aligned(cells, numbers=True), *([self.note] if self.note else [])])
 
 
@@ -115,8 +120,15 @@ def common_stamps(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.i
     """
     covered = estimate.covers(truth.stamps_ns)
     if not covered.any():
-        raise NoCommonTimeError("the track and the truth share no time: check the stamps of truth_topic")
+        raise NoCommonTimeError(
+            f"the track ({_when(estimate)}) and the truth ({_when(truth)}) share no time: check the stamps of truth_topic, and "
+            "truth_time_offset_s"
+        )
     return truth.stamps_ns[covered], float(covered.mean())
+
+
+def _when(track: Trajectory) -> str:
+    return " to ".join(utc_text(int(stamp)) for stamp in track.stamps_ns[[0, -1]])
 
 
 def errors(estimate: Trajectory, truth: Trajectory) -> TrackErrors:
@@ -349,9 +361,13 @@ def held_out_table(
         slow: by name of the estimate, its slow errors as for `compare_to_held_out`.
     """
     rows = [(name, compare_to_held_out(t, held, datum, antennas.of(name), slow.get(name))) for name, t in estimates]
-    return _table(
-        "Against held-out fixes", rows, "the fixes' own noise is part of the error; gaps lack GNSS velocities, too"
-    )
+    note = "the fixes' own noise is part of the error; gaps lack GNSS velocities, too"
+    kept = {name for name, row in rows if row.fix_rmse_m is not None}
+    if kept and len(kept) < len(rows):  # a row of dashes but for one
+        note += (
+            f"; fix_rmse_m takes off the receiver's slow error over time, which only {' and '.join(sorted(kept))} keeps"
+        )
+    return _table("Against held-out fixes", rows, note)
 
 
 def speed_table(estimates: _Named, check: SpeedSeries, switched_off: str = "") -> Table:

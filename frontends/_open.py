@@ -7,7 +7,7 @@ import logging
 import re
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,6 +32,7 @@ HINTS = {
     ".db3": "try `sqlite3 FILE .recover` and `ros2 bag reindex`",
     "": "try `ros2 bag reindex`",
 }
+_LFS = b"version https://git-lfs"  # begins the file that stands for another one in a checkout without Git LFS
 
 
 class Opened(NamedTuple):
@@ -108,7 +109,7 @@ class BagOpener:
             view = as_ros2(path) if path.is_file() else None
             reader = _open_reader(kind, view or path)
         except Exception as error:  # noqa: BLE001 - rosbags lets struct, assertion, sqlite and codec errors through
-            reason = f"{path}: cannot be read ({text_of(error)}); {HINTS.get(suffix_of(path), HINTS[''])}"
+            reason = f"{path}: cannot be read ({text_of(error)}); {_hint(path)}"
             repaired = recover(path) if path.is_file() else None
             if repaired is None or not self._try_recovered(path, kind, repaired):
                 # Only now: the summary alone may be damaged.
@@ -171,6 +172,14 @@ def _not_named(folder: Path) -> list[str]:
     """Return the files of a folder that its metadata.yaml does not name, such as those of a recorder that crashed."""
     named = (folder / "metadata.yaml").read_text(encoding="utf-8", errors="replace")
     return sorted(p.name for p in folder.iterdir() if p.suffix in (".mcap", ".db3") and p.name not in named)
+
+
+def _hint(path: Path) -> str:
+    """Return what to do about a file that cannot be read."""
+    with suppress(OSError), path.open("rb") as file:  # not of a folder, nor of a file that may not be read
+        if file.read(len(_LFS)) == _LFS:
+            return "it is a pointer of Git LFS, not the file itself: `git lfs pull` fetches that"
+    return HINTS.get(suffix_of(path), HINTS[""])
 
 
 def _instead(folder: Path) -> str:

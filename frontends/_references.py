@@ -15,7 +15,7 @@ from graphloc.frames import Array
 from graphloc.frontends import _clock
 from graphloc.frontends.decode import MOST_DISTANCE_M, MOST_SPEED_MPS, pose_of
 from graphloc.recording import SpeedSeries
-from graphloc.time import seconds_since
+from graphloc.time import NS_PER_S, seconds_since
 from graphloc.trajectory import Trajectory
 
 
@@ -47,8 +47,12 @@ class Reference:
             column[:] = list(compress(column, kept))
 
 
-def true_trajectory(item: Reference, warnings: list[str]) -> Trajectory | None:
-    """Return the true trajectory, with velocity; None of fewer than two usable poses. Poses left out give a warning."""
+def true_trajectory(item: Reference, offset_s: float, warnings: list[str]) -> Trajectory | None:
+    """Return the true trajectory, with velocity; None of fewer than two usable poses. Poses left out give a warning.
+
+    Args:
+        offset_s: added to its stamps.
+    """
     poses = [(s, *pose_of(m), m) for s, m in zip(item.stamps_ns, item.messages, strict=True)]
     good = [(s, p, R, m) for s, p, R, m in poses if R is not None and (np.abs(p) <= MOST_DISTANCE_M).all()]
     stamps = np.array([s for s, _, _, _ in good], dtype=np.int64)
@@ -57,7 +61,7 @@ def true_trajectory(item: Reference, warnings: list[str]) -> Trajectory | None:
         warnings.append(f"{item.topic}: {item.count - len(keep)} truth messages left out (stamp or pose not usable)")
     if len(keep) < 2:
         return None
-    stamps = stamps[keep]
+    stamps = stamps[keep] + round(offset_s * NS_PER_S)
     p, R = np.array([good[i][1] for i in keep]), np.array([good[i][2] for i in keep])
     v = _true_velocity(stamps, p, R, [good[i][3] for i in keep])
     return Trajectory(stamps_ns=stamps, p_world_m=p, R_world_body=R, v_world_mps=v)

@@ -25,7 +25,7 @@ _MAGNETIC = "sensor_msgs/msg/MagneticField"
 # Types of packets and clouds of makers, and of scans of a plane; then of lists of tags other than `LISTS`.
 _LIDAR = re.compile(r"LaserScan|livox|velodyne|ouster|pandar|hesai|rslidar|robosense|lidar", re.IGNORECASE)
 _TAGS = re.compile(r"april|aruco|fiducial|CompressedVideo|FFMPEGPacket|theora", re.IGNORECASE)
-_SPEED = re.compile(r"speed|stw|sog|knots|velocity", re.IGNORECASE)
+_SPEED = re.compile(r"speed|stw|sog|knots|kts|velocity|paddle|impeller|(?<![a-z])(kn|km_?h|kmph|mps)$", re.IGNORECASE)
 
 
 def lacking(

@@ -137,7 +137,7 @@ def read_recording(bags: Bags | Bag, config: VesselConfig, progress: Progress | 
         message_count=sum(len(r.values) for r in sensors) + sum(r.count for r in rows),
         topics={r.sensor: r.config.topic for r in sensors},
         mounts=mounts,
-        truth=true_trajectory(truth, warnings) if truth else None,
+        truth=true_trajectory(truth, config.truth_time_offset_s, warnings) if truth else None,
         check_speed=check_speed(check) if check else None,
         warnings=tuple(warnings),
         span=span,

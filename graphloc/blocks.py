@@ -76,6 +76,15 @@ class MountConfig(Block):
         return cls(xyz_m=tuple(xyz_m.tolist()), rpy_deg=tuple(rpy_deg.tolist()))
 
 
+_IN_YAML = {  # what pydantic says in terms of Python
+    "tuple_type": "a list in brackets is wanted",
+    "list_type": "a list in brackets is wanted",
+    "dict_type": "a block of keys is wanted",
+    "model_type": "a block of keys is wanted",
+    "string_type": "a text is wanted",
+}
+
+
 def nearest(key: str, known: list[str]) -> str:
     """Return the end of a message on a wrong key: the known key that may be meant, and all known ones, if they are few."""
     close = difflib.get_close_matches(key, known, n=len(known) or 1, cutoff=0.4)
@@ -103,19 +112,36 @@ def _fields_at(model: type[BaseModel], path: list[str]) -> list[str]:
 def one_line(error: ValidationError, model: type[BaseModel], where: str, prefix: str) -> str:
     """Return what is wrong with a block, in one line: bad keys with their nearest neighbours, bad values."""
     lines = []
+    counts = _wrong_counts(error)
     for item in error.errors()[:_MOST_SAID]:
         path = [str(p) for p in item["loc"]]
+        if item["type"] == "missing" and isinstance(item["loc"][-1], int):
+            path = path[:-1]  # the list, of which an item is missing
         name = ".".join([*([prefix] if prefix else []), *path])
         if item["type"] == "extra_forbidden":
             lines.append(f"unknown key '{name}'{nearest(path[-1], _fields_at(model, path[:-1]))}")
         else:
-            text = item["msg"].removeprefix("Value error, ")
+            text = counts.get(tuple(path)) or _IN_YAML.get(item["type"]) or item["msg"].removeprefix("Value error, ")
             whole_block = isinstance(item["input"], Mapping) and not item["type"].endswith("_type")
             got = "" if whole_block else f" (got {_short(item['input'])})"
             lines.append(f"{name + ': ' if name else ''}{text}{got}")
+    lines = list(dict.fromkeys(lines))
     if error.error_count() > _MOST_SAID:
         lines.append(f"and {error.error_count() - _MOST_SAID} more")
     return f"{where}: " + " ".join("; ".join(lines).split())
+
+
+def _wrong_counts(error: ValidationError) -> dict[tuple[str, ...], str]:
+    """Return by key of a list with too few or too many values how many are wanted, in words."""
+    wanted = dict[tuple[str, ...], int]()
+    for item in error.errors():
+        *way, last = item["loc"] or ("",)
+        if item["type"] == "missing" and isinstance(last, int):
+            key = tuple(map(str, way))
+            wanted[key] = max(wanted.get(key, 0), last + 1)
+        elif item["type"] == "too_long":
+            wanted[tuple(map(str, item["loc"]))] = int(item["ctx"]["max_length"])
+    return {key: f"{count} values are wanted" for key, count in wanted.items()}
 
 
 def _short(given: object) -> str:

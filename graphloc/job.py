@@ -116,9 +116,9 @@ def check(jobs: Sequence[Job]) -> None:
             continue
         config = app.configured(Path(job.config), _values(job.config_changes))
         check_bag([Path(job.bag)], config)
-        if not (config.truth_topic or config.check_speed_topic or job.hold_out):
+        if not (config.truth or config.check_speed_topic or job.hold_out):
             raise ConfigError(
-                f"{job.config}: no truth_topic, so nothing would be measured: give --hold-out, as gaps:8x10"
+                f"{job.config}: no truth_topic or truth_file, so nothing would be measured: give --hold-out, as gaps:8x10"
             )
 
 

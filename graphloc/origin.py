@@ -102,7 +102,7 @@ def refuse_world_without_datum(config: VesselConfig, where: str, rows: Sequence[
         InputError: there are such sensors.
     """
     in_world = [f"sensors.{name}" for row in rows if row.in_world for name in config.of_kind(row.kind)]
-    in_world += ["truth_topic"] if config.truth_topic else []
+    in_world += [key for key in ("truth_topic", "truth_file") if getattr(config, key)]
     if in_world and config.datum is None:
         raise InputError(
             f"{where}: {', '.join(in_world)}: positions in the world frame, but its origin is not given; "

@@ -162,6 +162,7 @@ def replay(
     lag_s: float = 10.0,
     datum: Datum | None = None,
     late_ns: Mapping[int, int] | None = None,
+    begin_ns: int | None = None,
     stoppable: bool = False,
     status: Status = silent,
 ) -> Replayed:
@@ -170,7 +171,7 @@ def replay(
     Args:
         scans: scans to match for the aerial sensors; None: use the matches in the recording.
         speed: times real time; None: as fast as possible. datum: origin of world; None: as `OnlineSmoother` finds it.
-        late_ns: as for `arrivals`.
+        late_ns: as for `arrivals`. begin_ns: from when the times of events count; None: from the first pose.
         stoppable: Ctrl-C ends the replay early, and the result up to then is returned, if it had started.
 
     Raises:
@@ -211,12 +212,14 @@ def replay(
             f"{recording.source}: never started: still waiting for {waiting or 'IMU data'}{_apart(recording, config)}{lost}"
         )
     recording = with_busy_warning(gathering.recording(), config)
-    return _result(session, recording, config, interrupted=interrupted)
+    return _result(session, recording, config, begin_ns, interrupted=interrupted)
 
 
-def _result(session: _Session, recording: Recording, config: VesselConfig, *, interrupted: bool) -> Replayed:
+def _result(
+    session: _Session, recording: Recording, config: VesselConfig, begin_ns: int | None, *, interrupted: bool
+) -> Replayed:
     estimates, update_s = session.estimates, np.array(session.update_s)
-    events = _timed(session.events, estimates)
+    events = _timed(session.events, estimates, begin_ns)
     if len(update_s) > 1:
         p50, p99, most = (1e3 * float(np.quantile(update_s[1:], q)) for q in (0.5, 0.99, 1.0))
         took = f"{p50:.1f} ms (median), {p99:.0f} ms (99 %), {most:.0f} ms (largest); start {1e3 * update_s[0]:.0f} ms"
@@ -242,9 +245,15 @@ def _result(session: _Session, recording: Recording, config: VesselConfig, *, in
     return Replayed(recording=recording, solution=solution, estimates=tuple(estimates), update_s=update_s)
 
 
-def _timed(happened: Sequence[tuple[int, Event]], estimates: Sequence[Estimate]) -> list[Event]:
-    """Return lines on events with their times, s since the first pose; for a guessed heading also until when, and what would end it."""
-    begin_ns = estimates[0].stamp_ns
+def _timed(
+    happened: Sequence[tuple[int, Event]], estimates: Sequence[Estimate], begin_ns: int | None = None
+) -> list[Event]:
+    """Return lines on events with their times, s since `begin_ns` (None: since the first pose).
+
+    For a guessed heading they also say until when, and what would end it.
+    """
+    if begin_ns is None:
+        begin_ns = estimates[0].stamp_ns
     guesses_ns = [stamp_ns for stamp_ns, event in happened if event.heading_guessed]
     timed = []
     for stamp_ns, event in happened:
@@ -259,7 +268,7 @@ def _timed(happened: Sequence[tuple[int, Event]], estimates: Sequence[Estimate])
                 else f"until {(last_ns - begin_ns) / 1e9:.0f} s"
             )
             line += (
-                f"; it stays so {until} ({(last_ns - max(stamp_ns, begin_ns)) / 1e9:.0f} s) and is not rated good; use a "
+                f"; it stays so {until} ({(last_ns - max(stamp_ns, estimates[0].stamp_ns)) / 1e9:.0f} s) and is not rated good; use a "
                 "compass, a dual antenna, wheels or a log (body_velocity), or start.heading_deg"
             )
         timed.append(event._replace(text=line))

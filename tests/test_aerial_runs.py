@@ -101,14 +101,22 @@ def test_one_match_is_of_one_scan(bag: Path) -> None:
         ({"image": "none.tif"}, "not an image"),
     ],
 )  # fmt: skip
-def test_a_matcher_that_cannot_work_is_one_line(changes: dict[str, Any], said: str, bag: Path) -> None:
+def test_a_matcher_that_cannot_work_is_one_line(
+    changes: dict[str, Any], said: str, bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was said after the first solution, which of a run of hours takes minutes."""
+    monkeypatch.setattr(_estimate, "solve", lambda *_, **__: pytest.fail("solved before it was said"))
     recording, vessel = loaded(bag)
     sensor = AerialConfig.model_validate({**vessel.sensors["aerial"].model_dump(), **changes})
     vessel = vessel.model_copy(update={"sensors": {**vessel.sensors, "aerial": sensor}})
-    with pytest.raises(InputError) as caught:
-        app.smooth_recording(recording, vessel, scans=app.Scans((bag / "run",), bag))
-    assert said in str(caught.value)
-    assert "\n" not in str(caught.value)
+    for work in (
+        lambda: app.smooth_recording(recording, vessel, scans=app.Scans((bag / "run",), bag)),
+        lambda: app.match_at(recording, vessel, app.Scans((bag / "run",), bag), 10.0, lambda *_: None),
+    ):
+        with pytest.raises(InputError) as caught:
+            work()
+        assert said in str(caught.value)
+        assert "\n" not in str(caught.value)
 
 
 def test_an_image_of_elsewhere_leaves_rows_in_the_ledger(bag: Path, tmp_path: Path) -> None:

@@ -87,6 +87,15 @@ def test_nothing_readable_names_the_tool_that_repairs(tmp_path: Path, name: str,
     one_line(error, name, hint)
 
 
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap", "a.db3"])
+def test_a_pointer_of_git_lfs_is_named(tmp_path: Path, name: str) -> None:
+    """No tool that repairs bags helps there."""
+    (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    with pytest.raises(InputError) as error:
+        read_recording(tmp_path / name, vessel())
+    one_line(error, name, "it is a pointer of Git LFS, not the file itself: `git lfs pull` fetches that")
+
+
 @cache
 def whole_file(kind: str, compression: str) -> bytes:
     """A bag of two and a half minutes: long enough for several chunks."""

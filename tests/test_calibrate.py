@@ -390,7 +390,10 @@ def test_of_a_delay_that_the_track_has_in_part_the_rest_is_asked_for(right: app.
     for taken_s, action in (
         (-0.38, "already corrected in the track, by stamp_sigma_s"),
         (None, "already corrected in the track, by stamp_sigma_s"),
-        (-0.2, "the track has -0.2 s of it corrected already, by stamp_sigma_s; measure it, then set it"),
+        (
+            -0.2,
+            "the track has only -0.2 s of it corrected, as far as stamp_sigma_s lets it (a warning may name that); measure it, then set it",
+        ),
     ):
         assert _suggestion(("gnss", "time"), off, {}, right.recording, config, taken_s).action == action
 

@@ -79,6 +79,7 @@ def test_a_draft_from_inspect_gives_a_track(
     assert "guess" in draft.read_text()
     assert called(monkeypatch, "smooth", where, "-c", draft, "-o", tmp_path / "run", "--json") == 0
     printed = capsys.readouterr().out
+    assert f"<h1>{where.name}</h1>" in (tmp_path / "run" / "report.html").read_text()  # not 'run: run.bag'
     truth = json.loads(printed[printed.index('{\n  "Against') : printed.rindex("}") + 1])["Against truth"]["graphloc"]
     assert truth["position_rmse_m"] < 3.0
     assert truth["heading_rmse_deg"] < 6.0
@@ -105,6 +106,27 @@ def test_a_draft_from_inspect_gives_a_track(
         ("topic: /gnss/fix", "topic: /gnss/fxi", "/gnss/fix"),
         ("kind: imu", "kind: imu\n    accel_unit: furlong", "accel_unit"),
         ("kind: imu", "kind: imu\n    accel_noise_ug_per_sqrt_hz: -3", "accel_noise_ug_per_sqrt_hz"),
+        (
+            "sensors:",
+            "sensors:\n  b: {kind: compass, topic: /c, mount: {xyz_m: [0, 0]}}",
+            "sensors.b.mount.xyz_m: 3 values are wanted (got [0, 0])",
+        ),
+        (
+            "sensors:",
+            "sensors:\n  b: {kind: compass, topic: /c, mount: {xyz_m: [0]}}",
+            "edited.yaml: sensors.b.mount.xyz_m: 3 values are wanted (got [0])",
+        ),
+        (
+            "sensors:",
+            "sensors:\n  b: {kind: compass, topic: /c, mount: {xyz_m: [0, 1, 2, 3]}}",
+            "xyz_m: 3 values are wanted (got [0, 1, 2, 3])",
+        ),
+        (
+            "sensors:",
+            "sensors:\n  b: {kind: compass, topic: /c, mount: {xyz_m: 1.5}}",
+            "xyz_m: a list in brackets is wanted (got 1.5)",
+        ),
+        ("kind: gnss", "kind: gnss\n    kernel: 2", "kernel: a block of keys is wanted (got 2)"),
         ("sensors:", "sensors: [", "that begins in line 2)"),
         ("sensors:", "vessel: !!python/object/apply:os.system ['touch pwned']\nsensors:", "not valid YAML"),
     ],
@@ -150,6 +172,7 @@ def test_bad_arguments_are_one_line(
         ([*good[:5], file / "run"], "is a file"),
         (["simulate", "bl1-pink", "-o", tmp_path / "sim"], "bl1-pink"),
         (["inspect", bag[0], "-o", bag[1] / "x.yaml"], "is a file, and a folder is wanted"),
+        (["inspect", tmp_path / "none.bag", "-o", file], f"{file}: exists already"),  # before minutes of reading
         (["smoth"], "Did you mean 'smooth'"),
         (["smooth"], "see graphloc smooth --help"),
         ([*good, "--foo"], "--foo"),

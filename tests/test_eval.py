@@ -1,5 +1,6 @@
 """Simulator, metrics and filters, each against something derived here."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -239,6 +240,12 @@ def test_a_track_apart_from_a_drifting_receiver_predicts_its_fixes() -> None:
         {"ours": {"gnss": drift}},
     )
     assert [row["fix_rmse_m"] for row in table.as_dict().values()] == [pytest.approx(1.0, abs=1e-6), None]
+    lines = table.as_text().splitlines()
+    assert any(line.split() == ["fix_rmse_m", "1.000", "-"] for line in lines)
+    untold = metrics.held_out_table([("ours", track)], held, datum, metrics.Antennas(configured=levers), {})
+    assert "fix_rmse_m" not in untold.as_text()  # a row of dashes alone
+    assert untold.as_dict()["ours"]["fix_rmse_m"] is None
+    assert table.note.endswith("; fix_rmse_m takes off the receiver's slow error over time, which only ours keeps")
 
 
 def test_forward_speed_by_hand() -> None:
@@ -299,6 +306,23 @@ def test_the_gate_of_the_thesis_drops_what_is_2_m_away() -> None:
     assert count[1] == 0
     track = metrics.compare_to_truth(free.trajectory, run.truth)
     assert track.position_rmse_m < 1.0
+
+
+@pytest.mark.parametrize(("bias_radps", "off"), [(0.0, False), (0.0175, True)])
+def test_the_filter_of_the_thesis_says_why_a_gyroscope_turns_it_away(bias_radps: float, off: bool) -> None:
+    """1 deg/s: its heading goes away from the compass by tens of degrees, and the report left the reason to guess."""
+    still = Scenario(duration_s=60.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gyro_bias_radps=bias_radps)
+    run = simulate(still, 3)
+    datum = app.choose_datum(run.recording, run.config)
+    found = ekf.run_bl(run.recording, run.config, datum)
+    beside = metrics.compare_to_truth(found.trajectory, run.truth).heading_rmse_deg
+    assert ("no state for the gyroscope's bias" in found.why) == off
+    if off:  # the compass's own error is a degree or two
+        said = re.match(r"its heading is (\d+) deg \(RMS\) off the headings that it is given", found.why)
+        assert said
+        assert float(said[1]) == pytest.approx(beside, abs=3.0)
+    else:
+        assert found.why == ""
 
 
 def filters(run: SimulatedRun, config: VesselConfig | None = None, **options: Any) -> dict[str, metrics.TruthMetrics]:

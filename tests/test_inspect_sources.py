@@ -962,7 +962,13 @@ def test_what_no_run_can_do_without_is_reported(scanned: bool, tmp_path: Path) -
     assert "IMU" not in said
 
 
-@pytest.mark.parametrize(("topic", "said"), [("/speed_log", True), ("/battery_voltage", False)])
+@pytest.mark.parametrize(
+    ("topic", "said"),
+    [
+        ("/speed_log", True), ("/paddle_wheel_kn", True), ("/own/kmh", True), ("/wheel/v_mps", True),
+        ("/battery_voltage", False), ("/engine/rpm", False), ("/skn", False), ("/known", False),
+    ],
+)  # fmt: skip
 def test_numbers_that_may_be_a_speed_are_said_to_be_one(topic: str, said: bool, tmp_path: Path) -> None:
     """Nothing of such a topic was in the text or in the draft."""
     make = Messages(2)

@@ -286,8 +286,12 @@ def test_truth_on_another_clock_is_reported_and_left_out() -> None:
     shifted = Trajectory(stamps_ns=truth.stamps_ns + 10**12, p_world_m=truth.p_world_m, R_world_body=truth.R_world_body)
     solved = app.smooth_recording(replace(run.recording, truth=shifted), run.config, compare=True)
     assert solved.recording.truth is None
-    assert any("share no time" in w for w in solved.recording.warnings)
+    first, last = (utc_text(int(stamp)) for stamp in shifted.stamps_ns[[0, -1]])
+    assert any(f"and the truth ({first} to {last}) share no time" in w for w in solved.recording.warnings)
     assert app.tables(solved) == ()
+    assert app.truth_statement(solved).startswith(
+        "No truth (/truth cannot be used: see the warnings) and no held-out fixes"
+    )
 
 
 def test_health_follows_what_agrees() -> None:

@@ -155,6 +155,12 @@ def test_compare_has_it_beside_the_filters(run: SimulatedRun) -> None:
     assert offline is not None
     assert online is not None
     assert offline <= online + 0.05
+    assert (
+        compared.online is not None
+    )  # whose first pose is seconds after the offline one; so are the times of its events
+    after_s = (compared.online.trajectory.stamps_ns[0] - compared.solution.trajectory.stamps_ns[0]) / 1e9
+    assert after_s > 4.0
+    assert any(line.startswith(f"at {after_s:.0f} s: started") for line in compared.online.stats.events)
 
 
 def test_a_guessed_heading_is_reported_with_its_times(whole: Replayed) -> None:
@@ -174,6 +180,9 @@ def test_a_guessed_heading_is_reported_with_its_times(whole: Replayed) -> None:
     assert "until 3 s (3 s)" in first.text
     assert "until 5 s (2 s)" in second.text
     assert _timed([(first_ns + 2_000_000_000, Event("rebuilt"))], some) == [Event("at 2 s: rebuilt")]
+    early_ns = first_ns - 7_000_000_000  # times count from there, and how long it stays so from the first pose
+    (said,) = _timed([(first_ns - 10, Event(doubt, heading_guessed=True))], some, early_ns)
+    assert said.text.startswith(f"at 7 s: {doubt}; it stays so until 12 s (5 s) and is not rated good")
 
 
 def test_the_start_is_told_but_no_warning(whole: Replayed) -> None:

@@ -113,7 +113,7 @@ def test_an_error_that_stays_the_same_is_named(data: ReportData, off_m: tuple[fl
     text = " ".join(reason.text for reason in reasons)
     stays = "All but 0.00 m (RMS) of its error stays the same, 1.50 m west and 0.40 m north of the truth"
     assert (stays in text) == any(off_m)
-    assert ("a mount, the datum or a noise is wrong" in text) != any(off_m)
+    assert ("a mount, the datum, a clock or a noise is wrong" in text) != any(off_m)
 
 
 def test_a_warning_on_both_tracks_is_listed_once(data: ReportData) -> None:

@@ -172,7 +172,8 @@ def _action(
         action = "already corrected in the track, by stamp_sigma_s"
         if taken_s is not None and abs(found.value - taken_s) > _MUCH_LESS * abs(found.value):
             action = (
-                f"the track has {taken_s:+.2g} s of it corrected already, by stamp_sigma_s; measure it, then set it"
+                f"the track has only {taken_s:+.2g} s of it corrected, as far as stamp_sigma_s lets it (a warning may name that); measure "
+                "it, then set it"
             )
     if name[1] in _AXIS and isinstance(block, GnssConfig | VelocityConfig) and block.mount_sigma_m > 0.0:
         action = "already corrected in the track, by mount_sigma_m; measure it, then set it and mount_sigma_m: 0"

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from graphloc.eval.ekf._planar import SILENT_Q, FilterResult, advance, run_filte
 from graphloc.frames import Array, Datum
 from graphloc.measurements import BodyVelocity, GnssPosition, GnssVelocity, Measurement, PoseFix
 from graphloc.recording import Recording
+from graphloc.signals.series import rms
+
+_FAR_OFF_DEG = 5.0  # RMS, several times the noise of any heading sensor that a filter is given
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,6 +56,7 @@ class _BlEkf:
     name = "BL EKF"
 
     def __init__(self, options: BlConfig) -> None:
+        self.heading_off_rad = list[float]()  # of each heading that it was given, from its own before
         self._options, self.rate_hz, self._dt = options, options.rate_hz, 1.0 / options.rate_hz
         s_acc = options.accel_noise_mg * 1e-3 * 9.81 / np.sqrt(options.rate_hz)  # eq. 3.2
         s_gyro = np.radians(options.gyro_noise_dps) / np.sqrt(options.rate_hz)  # eq. 3.1
@@ -77,9 +81,19 @@ class _BlEkf:
         a2 = o.a2_in_loss if lost else o.a2
         if isinstance(m, GnssPosition):
             return a2 * np.eye(2) * (o.gnss_rmse_m**2 if o.gnss_rmse_m else float(np.trace(R))) / 2.0
+        self.heading_off_rad.append(float(r[0]))
         return a2 * np.array([[np.radians(o.heading_rmse_deg) ** 2 / 2.0]])
 
 
 def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: BlConfig | None = None) -> FilterResult:
     """Run BL alg. 6. It does not use GNSS velocity."""
-    return run_filter(_BlEkf(options or BlConfig()), recording, config, datum)
+    filtered = _BlEkf(options := options or BlConfig())
+    result = run_filter(filtered, recording, config, datum)
+    off_deg = float(np.degrees(rms(np.array(filtered.heading_off_rad or [0.0]))))
+    if off_deg < _FAR_OFF_DEG:
+        return result
+    why = (
+        f"its heading is {off_deg:.0f} deg (RMS) off the headings that it is given: as printed it has no state for the gyroscope's bias, and "
+        f"takes the gyroscope to be good to {options.gyro_noise_dps:g} deg/s"
+    )
+    return replace(result, why=why)

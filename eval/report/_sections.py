@@ -105,7 +105,7 @@ def warnings_list(data: ReportData) -> str:
 def numbers(given: Table) -> str:
     """Return a whole table with a column per estimate, so that it fits a phone."""
     head = ["", *(name for name, _ in given.rows)]
-    rows = [[column, *(number(values[k]) for _, values in given.rows)] for k, column in enumerate(given.columns)]
+    rows = [[column, *map(number, values)] for column, values in given.told()]
     return f"<h3>{escape(given.title)}</h3>{table(head, rows)}{note(given.note)}"
 
 

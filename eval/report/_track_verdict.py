@@ -134,7 +134,10 @@ def _coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
     trust, why = Trust.YES, ""
     if covered < _NOT_COVERED:
         trust = Trust.NO
-        why = _constant(data, solution) or ". The bounds are far too small: a mount, the datum or a noise is wrong"
+        why = (
+            _constant(data, solution)
+            or ". The bounds are far too small: a mount, the datum, a clock or a noise is wrong"
+        )
     elif covered < _COVERED or (nees is not None and nees > _TOO_SURE):
         trust, why = Trust.WITH_CARE, _constant(data, solution) or "; they are too small"
     beside = "" if nees is None else f" (NEES {nees:.1f}; 2 where they are honest)"

@@ -21,9 +21,10 @@ from graphloc.eval.tag_check import suspect_tags
 from graphloc.eval.underlay import underlay
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Datum
-from graphloc.frontends.aerial import Match, match_bag
+from graphloc.frontends.aerial import Match, check_bag, match_bag
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.part import Bags
+from graphloc.frontends.tum import read_tum
 from graphloc.gather import Matches, Scans, with_matches, with_sightings, with_surveys
 from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.offsets import Probe
@@ -34,6 +35,7 @@ from graphloc.signals.frozen_receiver import without_frozen_fixes
 from graphloc.solution import Solution
 from graphloc.solve import smooth
 from graphloc.time import NS_PER_S, duration_ns
+from graphloc.trajectory import Trajectory
 
 _MOST_GROWN = 8  # times that scans are matched around what those within reach lead to: each carries it on for some 20 s
 _GAINS = 0.9  # of those beyond reach, that may be left for it to be worth its time
@@ -61,7 +63,19 @@ def load(
     """Read a vessel.yaml, some of its keys changed (`config.with_changes`), and the bag, or the part of it, that it describes."""
     config = configured(config_path, changes)
     recording = read_recording(bags, config, progress)
+    if config.truth_file:
+        recording = replace(recording, truth=_truth_of_file(Path(config_path).parent, config, recording))
     return with_sightings(recording, config, bags, progress), config
+
+
+def _truth_of_file(folder: Path, config: VesselConfig, recording: Recording) -> Trajectory:
+    """Return the truth that a file holds; of a part of a bag, what lies within the part."""
+    truth = read_tum(folder / config.truth_file, config.truth_time_offset_s)
+    if recording.span is None or recording.imu is None or not len(recording.imu):
+        return truth
+    first_ns, *_, last_ns = recording.imu.stamps_ns
+    inside = (truth.stamps_ns >= first_ns) & (truth.stamps_ns <= last_ns)
+    return truth.where(inside) if inside.sum() > 1 else truth
 
 
 def online_smoother(
@@ -108,6 +122,9 @@ def smooth_recording(
     datum = choose_datum(recording, config)
     recording = with_synthetic(recording, config, datum)
     matched = scans is not None and bool(config.of_kind("aerial"))
+    if scans is not None:  # not after the minutes of the first solution
+        for sensor in config.of_kind("aerial").values():
+            check_bag(scans.bags, sensor, scans.folder, config.body_frame, datum)
     solution = solve(recording, config, datum, probe=None if matched else calibrate.PROBE, progress=progress)
     pictures: tuple[tuple[str, bytes], ...] = ()
     if scans is not None and matched:
@@ -117,7 +134,7 @@ def smooth_recording(
     online, never = None, ""
     if compare:
         filters = _filters(recording, config, datum, progress)
-        online, never = _online(recording, config, datum, progress)
+        online, never = _online(recording, config, datum, solution, progress)
     if online is not None:
         beside = ekf.FilterResult(name=online.name, trajectory=online.trajectory, ledger=online.ledger)
         filters = (beside, *filters)
@@ -228,12 +245,13 @@ def _track_warnings(
 
 
 def _online(
-    recording: Recording, config: VesselConfig, datum: Datum, progress: Progress
+    recording: Recording, config: VesselConfig, datum: Datum, offline: Solution, progress: Progress
 ) -> tuple[Solution | None, str]:
-    """Return what the online mode makes of it, or why it made nothing."""
+    """Return what the online mode makes of it, or why it made nothing; its events are timed as the report of both is: by the offline track."""
+    begin_ns = int(offline.trajectory.stamps_ns[0])
     status = lambda at_s, whole_s, *_: progress("online", int(at_s), int(whole_s))
     try:
-        return replay(recording, config, datum=datum, status=status).solution, ""
+        return replay(recording, config, datum=datum, begin_ns=begin_ns, status=status).solution, ""
     except SolveError as error:
         return None, f"graphloc online is not compared: {error}"
 
@@ -308,6 +326,7 @@ def match_at(
         raise InputError("no sensor of kind aerial is enabled: set `enabled: true` in its block")
     (sensor, *_) = _matched_alone(config).of_kind("aerial").values()
     datum = choose_datum(recording, config)
+    check_bag(scans.bags, sensor, scans.folder, config.body_frame, datum)
     whole = with_synthetic(recording, config, datum)
     track = solve(whole, config, datum, progress=progress).trajectory
     span_s = (int(track.stamps_ns[-1]) - int(track.stamps_ns[0])) / 1e9

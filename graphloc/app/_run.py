@@ -10,6 +10,7 @@ from graphloc.build import mount_of
 from graphloc.config import VesselConfig
 from graphloc.eval import calibrate, ekf, metrics, report
 from graphloc.eval.plots import Underlay
+from graphloc.eval.truth_clock import clock_apart
 from graphloc.measurements import GnssPosition
 from graphloc.recording import Recording
 from graphloc.solution import Solution
@@ -38,9 +39,11 @@ class Run:
 
 
 def made_comparable(run: Run) -> Run:
-    """Drop what shares no time with the track, and say so."""
+    """Drop what shares no time with the track, and say so; say so, too, of a truth whose clock is another one."""
     truth, speed, held, track = run.recording.truth, run.recording.check_speed, run.held, run.solution.trajectory
     said: list[str] = []
+    if truth is not None and (apart := clock_apart(track, truth)) is not None:
+        said.append(apart.said(run.config.truth or "truth", run.config.truth_time_offset_s))
 
     def comparable(compare: Callable[..., object], *arguments: object) -> bool:
         try:

@@ -57,7 +57,7 @@ def truth_statement(run: Run) -> str:
     if run.recording.truth is not None:
         truth = run.recording.truth
         span_s = (int(truth.stamps_ns[-1]) - int(truth.stamps_ns[0])) / 1e9
-        named = run.config.truth_topic or "given with the recording"
+        named = run.config.truth or "given with the recording"
         imu = run.recording.imu
         begun = bool(run.filters) and imu is not None and bool(truth.covers(imu.stamps_ns[:1]).all())
         started = " The EKFs are started at it, as BL started theirs; graphloc is not." if begun else ""
@@ -81,15 +81,22 @@ def truth_statement(run: Run) -> str:
             f"No truth. {len(run.held)} GNSS fixes were kept out of the estimate and predicted; their own noise is part "
             f"of the error{drift}.{beside} The track in this folder lacks them: for the best track run again without --hold-out."
         )
-    said = "No truth and no held-out fixes: nothing here measures accuracy"
+    none = "No truth" if not run.config.truth else f"No truth ({run.config.truth} cannot be used: see the warnings)"
+    said = f"{none} and no held-out fixes: nothing here measures accuracy"
     by = suggested(run.recording.of(GnssPosition))
     return f"{said}. `graphloc compare --hold-out {by}` does." if by else f"{said}; a `truth_topic` would."
+
+
+def _titled(vessel: str, source: str) -> str:
+    """Return what a report is headed with; `inspect` names a vessel after its bag, and one name is enough then."""
+    bag = source.partition(", ")[0]
+    return source if vessel in (bag, Path(bag).stem) else f"{vessel}: {source}"
 
 
 def report_data(run: Run, command: str = "") -> report.ReportData:
     """Return what the report of a run shows."""
     return report.ReportData(
-        title=f"{run.config.vessel}: {Path(run.recording.source).name}",
+        title=_titled(run.config.vessel, Path(run.recording.source).name),
         solution=run.solution,
         recording=run.recording,
         config=run.config,

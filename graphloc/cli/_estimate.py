@@ -35,14 +35,14 @@ def inspect(
     from graphloc.folders import check_writable
     from graphloc.frontends import inspect as inspection
 
+    if config.exists() and not overwrite:
+        raise OutputError(f"{config}: exists already; give another --out, or --overwrite")
+    check_writable(config)
     found = inspection.inspect_bag(bag)
     typer.echo(json.dumps(found.as_dict(), indent=2) if as_json else inspection.render(found))
     if not found.usable:
         why = "; ".join(found.warnings) or "none of its topics has a supported sensor type (docs/quick-start.md)"
         raise InputError(f"{found.source}: no usable sensor in it, so {config} is not written: {why}")
-    if config.exists() and not overwrite:
-        raise OutputError(f"{config}: exists already; give another --out, or --overwrite")
-    check_writable(config)
     try:
         config.parent.mkdir(parents=True, exist_ok=True)
         config.write_text(inspection.draft_config(found), encoding="utf-8")

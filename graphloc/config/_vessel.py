@@ -96,6 +96,11 @@ class VesselConfig(Block):
     """Sensors by name; `kind` in each block selects the sensor kind."""
     truth_topic: str | None = None
     """Topic with the true body pose in world (`nav_msgs/Odometry`, `geometry_msgs/PoseStamped`, `PoseWithCovarianceStamped`, `TransformStamped`), for comparisons only; never fused."""
+    truth_file: str = ""
+    """In place of it a file of TUM's form, as evo writes it, path as for an aerial image: lines of stamp (s since 1970), x y z (m, world),
+    qx qy qz qw, of body."""
+    truth_time_offset_s: Annotated[float, Field(ge=-4e9, le=4e9)] = 0.0
+    """Added to the stamps of the truth, s: -18 for one in GPS time beside sensors in UTC."""
     check_speed_topic: str | None = None
     """`nav_msgs/Odometry` whose forward speed is compared with the solution's; never fused."""
     timeline: TimelineConfig = TimelineConfig()
@@ -158,6 +163,8 @@ class VesselConfig(Block):
     @model_validator(mode="after")
     def _references_are_not_fused(self) -> VesselConfig:
         """What the track follows cannot say how good it is."""
+        if self.truth_topic and self.truth_file:
+            raise ValueError("truth_topic and truth_file: there can be only one truth: delete one")
         for key in ("truth_topic", "check_speed_topic"):
             topic = getattr(self, key)
             fused = [
@@ -168,6 +175,11 @@ class VesselConfig(Block):
                     f"{key}: {', '.join(fused)} fuses {topic}, and a comparison with it says nothing: delete one"
                 )
         return self
+
+    @property
+    def truth(self) -> str:
+        """Topic or file of the truth; empty: there is none."""
+        return self.truth_topic or self.truth_file
 
     def with_sensors(self, changed: Mapping[str, Any]) -> VesselConfig:
         """Return the configuration with some of its sensors replaced."""
