@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from graphloc import app
+from graphloc.eval.report import Trust, verdict
 from graphloc.eval.simulate import Scenario
 from graphloc.eval.truth_clock import clock_apart
 from graphloc.frames import Array
@@ -106,6 +107,9 @@ def test_a_run_says_so_of_its_truth() -> None:
     named = re.search(r"^/truth: .* set truth_time_offset_s: (-?[\d.]+)$", said)
     assert named
     assert float(named[1]) == pytest.approx(-18.0, abs=0.1)
+    (track,) = verdict(app.report_data(late)).tracks
+    assert any("truth is on another clock" in reason.text for reason in track.reasons)
+    assert not any(reason.trust is Trust.NO for reason in track.reasons)
     assert clock_apart(late.solution.trajectory, run.truth) is None
 
 

@@ -16,6 +16,7 @@ from graphloc.eval.formatting import percent
 from graphloc.eval.metrics import Table, errors, held_out_errors, receiver_errors, squared_over_covariance
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
+from graphloc.eval.truth_clock import clock_apart
 from graphloc.frames import Array
 from graphloc.measurements import GnssPosition
 from graphloc.signals.frozen_receiver import FROZEN
@@ -132,7 +133,11 @@ def _coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
     if covered is None:
         return
     trust, why = Trust.YES, ""
-    if covered < _NOT_COVERED:
+    truth = data.recording.truth
+    if covered < _COVERED and truth is not None and clock_apart(solution.trajectory, truth) is not None:
+        trust = Trust.WITH_CARE
+        why = ". That says nothing of the track: the truth is on another clock (see the warnings)"
+    elif covered < _NOT_COVERED:
         trust = Trust.NO
         why = (
             _constant(data, solution)
