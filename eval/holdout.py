@@ -53,6 +53,10 @@ class HoldOut:
     gaps: int = 0
     gap_s: float = 0.0
 
+    def __str__(self) -> str:
+        """Return it as on the command line."""
+        return "--hold-out " + (f"every:{self.every}" if self.every else f"gaps:{self.gaps}x{self.gap_s:g}")
+
     @staticmethod
     def parse(text: str) -> HoldOut:
         """Parse `every:N` or `gaps:COUNTxSECONDS`.
@@ -81,26 +85,36 @@ class HoldOut:
         span = (fixes[-1].stamp_ns - fixes[0].stamp_ns) * 1e-9
         if self.gaps and self.gap_s * (self.gaps + 1) >= span:
             raise ConfigError(
-                f"{recording.source}: --hold-out gaps:{self.gaps}x{self.gap_s:g}: the gaps do not fit into the "
+                f"{recording.source}: {self}: the gaps do not fit into the "
                 f"{span:.1f} s from the first fix to the last; ask for fewer or shorter ones"
             )
         # Counted for each receiver: of two receivers that alternate, every second fix would be all of one.
         number: defaultdict[str, count[int]] = defaultdict(count)
         held = tuple(m for m in fixes if self._holds(next(number[m.sensor]), m, fixes))
         if not held:
-            raise ConfigError(f"{recording.source}: --hold-out every:{self.every} holds nothing of {len(fixes)} fixes")
-        velocities = [m for m in recording.of(GnssVelocity) if self._in_a_gap(m, fixes)]
+            raise ConfigError(f"{recording.source}: {self} holds nothing of {len(fixes)} fixes")
+        velocities = [m for m in recording.of(GnssVelocity) if self._gaps_of(m, fixes)]
         gone = {id(m) for m in (*held, *velocities)}
         rows = [recording.row_of(m, Outcome.HELD_OUT, "kept out of the graph to test it") for m in held]
         rows += [recording.row_of(m, Outcome.HELD_OUT, "kept out with the fixes of a gap") for m in velocities]
         kept = recording.where(lambda m: id(m) not in gone)
-        return replace(kept, rows=(*recording.rows, *rows)), held
+        warnings = (*kept.warnings, *self._of_empty_gaps(held, fixes))
+        return replace(kept, rows=(*recording.rows, *rows), warnings=warnings), held
+
+    def _of_empty_gaps(self, held: Sequence[GnssPosition], fixes: list[GnssPosition]) -> list[str]:
+        """Return a warning if some gaps lie where there are no fixes that could be held out."""
+        full = {n for m in held for n in self._gaps_of(m, fixes)}
+        if len(full) == self.gaps:
+            return []
+        said = f"{self}: {self.gaps - len(full)} of the gaps lie where there are no fixes anyway"
+        return [f"{said}: the error is that of the other {len(full)}"]
 
     def _holds(self, i: int, m: GnssPosition, fixes: list[GnssPosition]) -> bool:
-        return i % self.every == self.every - 1 if self.every else self._in_a_gap(m, fixes)
+        return i % self.every == self.every - 1 if self.every else bool(self._gaps_of(m, fixes))
 
-    def _in_a_gap(self, m: Measurement, fixes: list[GnssPosition]) -> bool:
+    def _gaps_of(self, m: Measurement, fixes: list[GnssPosition]) -> list[int]:
+        """Return the numbers of the gaps that a measurement lies in."""
         span = (fixes[-1].stamp_ns - fixes[0].stamp_ns) * 1e-9
         at = (m.stamp_ns - fixes[0].stamp_ns) * 1e-9
         centres = (span * (n + 1.0) / (self.gaps + 1.0) for n in range(self.gaps))
-        return any(abs(at - c) <= self.gap_s / 2.0 for c in centres)
+        return [n for n, centre in enumerate(centres) if abs(at - centre) <= self.gap_s / 2.0]

@@ -124,6 +124,18 @@ def test_gaps_are_where_they_should_be() -> None:
     assert abs(inside[1].sum() - 100) <= 2
 
 
+def test_a_gap_where_there_are_no_fixes_anyway_is_said_not_to_count() -> None:
+    run = simulate(Scenario(duration_s=90.0, imu_hz=10.0, noise="clean"), 0)
+    silent = run.recording.measurements[0].stamp_ns + np.array([20, 40]) * 10**9
+    heard = run.recording.where(lambda m: not (isinstance(m, GnssPosition) and silent[0] < m.stamp_ns < silent[1]))
+    kept, held = HoldOut.parse("gaps:2x10").split(heard)
+    assert min(m.stamp_ns for m in held) > silent[1]
+    (said,) = set(kept.warnings) - set(heard.warnings)
+    assert said.startswith("--hold-out gaps:2x10: 1 of the gaps ")
+    assert said.endswith("of the other 1")
+    assert HoldOut.parse("gaps:2x10").split(run.recording)[0].warnings == run.recording.warnings
+
+
 def test_a_gap_is_an_outage_of_gnss_and_of_nothing_else() -> None:
     """A receiver's velocities of the gap's epochs, fused, would leave nothing to drift; wheels go on, and so do velocities beside every n-th fix."""
     run = simulate(Scenario(duration_s=90.0, imu_hz=10.0, noise="clean"), 0)
