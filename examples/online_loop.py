@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Online, in a loop of one's own: feed what arrives, ask for the pose when it is needed."""
 
-from graphloc import ImuSample, online_smoother
+from graphloc import ImuSample, arrivals, online_smoother
 from graphloc.eval.simulate import find_scenario, simulate
-from graphloc.replay import arrivals
 
 run = simulate(find_scenario("bl1-drift", {"duration_s": "30"}), seed=1)  # a vessel has its drivers instead
 smoother = online_smoother(run.config)

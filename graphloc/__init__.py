@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     )
     from graphloc.online import OnlineSmoother
     from graphloc.recording import Recording
+    from graphloc.replay import arrivals
     from graphloc.solution import Solution
     from graphloc.trajectory import Trajectory
 
@@ -40,6 +41,7 @@ _HOMES = {
     ),
     "online": ("OnlineSmoother",),
     "recording": ("Recording",),
+    "replay": ("arrivals",),
     "solution": ("Solution",),
     "trajectory": ("Trajectory",),
 }  # fmt: skip
@@ -68,6 +70,7 @@ __all__ = [
     "Trajectory",
     "VesselConfig",
     "__version__",
+    "arrivals",
     "configured",
     "load",
     "online_smoother",
