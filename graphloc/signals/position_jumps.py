@@ -78,7 +78,7 @@ def position_jumps(
         allowed_m: size up to which the bounds already include a jump (`build.allowed_jump_m`).
     """
     if len(stamps_ns) < _FEWEST:
-        return np.zeros(0, dtype=np.int64), np.zeros(0)
+        return _none()
     steps, dt = np.diff(places_m, axis=0), np.diff(stamps_ns) / NS_PER_S
     usual_s = float(np.median(dt))
     # Steps are proportional to the time between stamps if these are of the measurements, but not if they are of
@@ -97,8 +97,10 @@ def position_jumps(
     # metres.
     believed_m = np.maximum(_BRAKES_MPS2 * usual_s**2 / 2.0, _SIGMAS * window(sigma_m, 4).max(axis=1))
     least_m = np.minimum(_JUMP_M * max(usual_s, 1.0) ** 2, np.maximum(believed_m, allowed_m))
-    least_m = np.maximum(least_m, _JUMP * _usual(off_m))
-    far = np.flatnonzero(even & (off_m >= beside) & (off_m > least_m) & (both > off_m / 2.0))
+    large = even & (off_m >= beside) & (off_m > least_m) & (both > off_m / 2.0)
+    if not large.any():  # what is usual takes most of the time, and online there is a fix several times a second
+        return _none()
+    far = np.flatnonzero(large & (off_m > _JUMP * _usual(off_m)))
     far = far[(far > 0) & (far < len(off_m) - 1)]  # at either end an outlier looks like half a jump
     near = np.abs(np.subtract.outer(stamps_ns[far], stamps_ns[far])) <= _BURST_S * NS_PER_S
     back = np.linalg.norm(parts[far][:, None] + parts[far][None], axis=2) < off_m[far] / 2.0
@@ -120,7 +122,7 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
     fewest = _FEWEST_BESIDE if usual_s < _SLOW_S else 2
     n = max(fewest, round(_BESIDE_S / max(usual_s, 1e-3)))
     if len(off_m) < max(2 * n, _FEWEST):
-        return np.zeros(0, dtype=np.int64), np.zeros(0)
+        return _none()
     steps = np.diff(off_m, axis=0)
     windows = np.lib.stride_tricks.sliding_window_view(off_m, n, axis=0)
     medians = np.median(windows, axis=-1)
