@@ -26,6 +26,7 @@ from graphloc.signals.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.signals.white_noise import white_noise
 from graphloc.time import NS_PER_S, stamps_of
 
+_STRAIGHT_DEG = 20.0  # 1 sigma of courses that go one way; a choice
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
 _EITHER = 0.01  # least share of RTK fixes, and of others, of a receiver that has RTK by turns
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
@@ -60,6 +61,15 @@ class Courses:
 
     stamps_ns: NDArray[np.int64]
     course_rad: Array
+
+
+def nearly_straight(course_rad: Array) -> bool:
+    """Return whether courses (N,), rad, go one way.
+
+    Such courses tell neither the convention of a heading nor, to less than leeway and current, its offset.
+    """
+    mean = max(abs(np.exp(1j * course_rad).mean()), 1e-9)
+    return float(np.degrees(np.sqrt(max(0.0, -2.0 * np.log(mean))))) < _STRAIGHT_DEG
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -249,7 +249,7 @@ def _mount_yaw(levelled: _Samples, motions: Sequence[MeasuredMotion]) -> tuple[f
 
     Returns:
         The yaw, deg: a multiple of 90 unless the motion clearly contradicts it; None where nothing tells it. Its 1
-        sigma, deg, if it is no multiple of 90; else None. The evidence.
+        sigma, deg, if it may be no multiple of 90; else None. The evidence.
     """
     if not motions:
         return None, None, "no motion to find its yaw from"
@@ -264,10 +264,17 @@ def _mount_yaw(levelled: _Samples, motions: Sequence[MeasuredMotion]) -> tuple[f
         return yaw, None, f"{said}: taken as {yaw:.0f}"
     if not found.clear:
         return None, None, f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
-    askew = abs(found.yaw_deg - quarter) > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
+    off_deg = abs(found.yaw_deg - quarter)
+    turned = off_deg > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
+    askew = turned and not found.straight
     yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter)))) + 0.0
     said = f"yaw by the motion of {found.source}: {found.yaw_deg:z.0f} deg (coherence {found.coherence:.2f})"
-    off_deg = abs(found.yaw_deg - quarter)
+    if turned and found.straight:
+        said += (
+            f", taken as {yaw:.0f}: she goes one way, so leeway or a current may set her by that; where she is not set sideways, as "
+            f"on wheels, set {found.yaw_deg:.0f}"
+        )
+        return yaw, off_deg / float(np.sqrt(2.0)), said  # either is as likely
     if not askew and off_deg > max(_SLIGHTLY_DEG, 4.0 * found.sigma_deg):
         said += (
             f", taken as {yaw:.0f}, since leeway makes a few degrees: on wheels set {found.yaw_deg:.0f}, or the heading is off by "

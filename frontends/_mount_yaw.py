@@ -17,7 +17,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Slerp
 
 from graphloc.frames import Array, wrap_angle
-from graphloc.frontends._assess import MeasuredMotion
+from graphloc.frontends._assess import MeasuredMotion, nearly_straight
 from graphloc.frontends.turning import Turning
 from graphloc.signals.series import integral
 from graphloc.time import NS_PER_S
@@ -45,6 +45,7 @@ class YawInCraft:
     Attributes:
         source: of the motion. yaw_deg: from the craft's forward to the sensor's x, positive to port.
         coherence: how clear it is, 0 to 1. chance: the coherence that chance gives.
+        straight: whether it is by courses that go one way, from which leeway or a current may keep the heading.
         differs_deg: by how much the yaw differs by other motions or windows that are nearly as coherent, at most.
     """
 
@@ -52,6 +53,7 @@ class YawInCraft:
     yaw_deg: float
     coherence: float
     chance: float
+    straight: bool = False
     differs_deg: float = 0.0
 
     @property
@@ -217,8 +219,9 @@ def _yaw_by(felt: Felt, motion: MeasuredMotion, half_s: float) -> YawInCraft | N
         heads = np.exp(1j * np.interp(middle, at, np.unwrap(motion.attitude.as_euler("ZYX")[:, 0])))
     else:
         heads = faced if motion.way_m is None else chord / np.maximum(np.abs(chord), MOVES_M)
+    straight = motion.attitude is None and motion.way_m is not None and nearly_straight(np.angle(chord[good]))
     m, f = (moved * np.conj(heads))[good], (f * np.conj(faced))[good]
-    return _turn_between(motion.source, f, m, windows)
+    return replace(_turn_between(motion.source, f, m, windows), straight=straight)
 
 
 def _yaw_by_tipping(felt: Felt, gyro: Array, motion: MeasuredMotion) -> YawInCraft | None:

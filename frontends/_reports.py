@@ -112,8 +112,8 @@ class MountGuess:
     Attributes:
         rpy_deg: roll, pitch, yaw. tf_frame: frame of tf that tells the mount; None if it is not from tf.
         evidence: in words. xyz_m: its position; None if unknown.
-        yaw_told: whether anything tells its yaw. yaw_sigma_deg: 1 sigma of a yaw that is no multiple of 90 deg; else
-            None.
+        yaw_told: whether anything tells its yaw. yaw_sigma_deg: 1 sigma of a yaw that may be no multiple of 90 deg;
+            else None.
     """
 
     rpy_deg: Vec
@@ -277,6 +277,7 @@ class CompassReport:
         leeway_deg: how far the offset wanders from half minute to half minute, by leeway or the compass; None if
             unknown. Of a vessel that is set sideways, this and the offset are None, unless two antennas are mounted
             athwart.
+        straight: whether the courses go one way: then leeway or a current may make any offset, all along.
         samples: number of courses compared. why: the judgement in words. unit: of bare numbers; else None.
         like: an orientation of the same device that says the same; else ''.
         wander_deg: wander of its error beside the gyroscope, 1 sigma in a minute; None if that is not told.
@@ -299,6 +300,7 @@ class CompassReport:
     unit: str | None = None
     like: str = ""
     leeway_deg: float | None = None
+    straight: bool = False
     wander_deg: float | None = None
     two_antennas: bool = False
     late_s: tuple[float, float] | None = None
@@ -312,14 +314,16 @@ class CompassReport:
 
     @property
     def turned_deg(self) -> float:
-        """Yaw of its mount that is assumed: a multiple of 90 deg, unless the course clearly says otherwise.
+        """Yaw of its mount that is assumed: a multiple of 90 deg, unless courses to several sides clearly say otherwise.
 
         It is 0 where leeway explains the offset, or nothing tells.
         """
         if self.offset_deg is None or abs(self.offset_deg) <= TURNED_DEG:
             return 0.0
         quarter = 90.0 * round(self.offset_deg / 90.0)
-        return quarter if abs(self.offset_deg - quarter) < _ASKEW_DEG else float(round(self.offset_deg))
+        if self.straight or abs(self.offset_deg - quarter) < _ASKEW_DEG:
+            return quarter
+        return float(round(self.offset_deg))
 
     @property
     def backwards(self) -> bool:

@@ -405,7 +405,7 @@ def _velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Veloc
     v = nmea.velocity_mps(nmea.text_of(msg), config.nmea)
     if isinstance(v, Rejection):
         return v
-    return _moving((*v, 0.0), np.diag([0.0, 0.0, _NO_CLIMB_MPS2]), stamp_ns, seq, sensor, config)
+    return _moving((*v, np.nan), np.zeros((3, 3)), stamp_ns, seq, sensor, config)
 
 
 def gps_fix_velocity_mps(msg: Any) -> tuple[float, float, float] | Rejection:
@@ -429,18 +429,24 @@ def _velocity_gps_fix(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Ve
     v = gps_fix_velocity_mps(msg)
     if isinstance(v, Rejection):
         return v
-    climbs = isfinite(v[2])
-    cov = np.diag([0.0, 0.0, 0.0 if climbs else _NO_CLIMB_MPS2])
-    return _moving((*v[:2], v[2] if climbs else 0.0), cov, stamp_ns, seq, sensor, config)
+    return _moving(v, np.zeros((3, 3)), stamp_ns, seq, sensor, config)
 
 
 def _moving(
     v_mps: tuple[float, float, float], cov: Array, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig
 ) -> Decoded:
+    """Return a velocity over ground, horizontal where its up is NaN or exactly 0.
+
+    No receiver measures exactly 0, but drivers of NMEA leave it so, also in a Twist, and with any covariance.
+    """
     value = np.array(v_mps, dtype=float)
+    default = np.full(3, config.default_sigma_mps**2)
+    if value[2] == 0.0 or np.isnan(value[2]):
+        value[2], default[2] = 0.0, _NO_CLIMB_MPS2
+        cov = cov.copy()
+        cov[2], cov[:, 2] = 0.0, 0.0
     if trouble := _no_velocity(value):
         return trouble
-    default = np.full(3, config.default_sigma_mps**2)
     return GnssVelocity(
         stamp_ns=stamp_ns, sensor=sensor, seq=seq, v_enu_mps=value, cov_m2ps2=usable_covariance(cov, default)
     )

@@ -164,7 +164,9 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion, most_s: float = FARTH
     the turns of the gyroscope: in a turn where the craft brakes, heading and chord differ, and what it feels across
     would look like a delay. Pitch swings a high antenna along the course, so its height (0 m, give or take ten) is
     estimated with the offset: c is the correlation with what is felt and that swing together. With c at the best offset
-    and c0 at none, N (c^2 - c0^2) / (1 - c^2) is the gain in chi-square over N windows.
+    and c0 at none, N (c^2 - c0^2) / (1 - c^2) is the gain in chi-square over N windows. Of the windows' durations the one
+    counts whose best offset explains most, by -N log(1 - c^2) / 2: in windows that average the motion out, what is left
+    fits some offset by chance, and may deny a delay of none the most.
 
     Args:
         felt: of an IMU, in the axes of the vessel. motion: positions, or a velocity over ground.
@@ -194,31 +196,43 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion, most_s: float = FARTH
         return None
     felt_at = (_felt_along(felt, at, motion.speed_mps, lengths, lag) for lag in lags)
     sums_of = zip(*felt_at, strict=True)
-    found: list[tuple[float, float, float]] = []
+    found: list[tuple[float, MotionOffset]] = []
     for own, by_lag in zip(lengths, sums_of, strict=True):
         sums = np.stack(by_lag)
         total = sums.sum(axis=1)
         whole = _best_lag(total, lags, own.windows)
         if whole is None:
             continue
-        better, value, sigma = whole
+        told, better, value, sigma = whole
         # A jump of the fixes is an acceleration that some lag fits by chance: a jackknife over blocks shows that.
         blocks = len(own.begun)
         if blocks > 2:
             rest = (total - sums[:, k] for k in range(blocks))
             without = [_best_lag(r, lags, own.windows * float(r[0, 0, 0]) / len(own.along)) for r in rest]
-            values = np.array([np.inf if one is None else one[1] for one in without])
+            values = np.array([np.inf if one is None else one.value_s for one in without])
             scatter = np.sqrt((blocks - 1) * np.var(values)) if np.isfinite(values).all() else np.inf
             sigma = max(sigma, float(scatter))
-        found.append((better, value, sigma))
-    if not found:
-        return None
-    better, value, sigma = max(found)
-    return MotionOffset(value, sigma, better > _CLEAR**2 and abs(value) > max(_CLEAR * sigma, _LEAST_OF_WAY_S))
+        clear = better > _CLEAR**2 and abs(value) > max(_CLEAR * sigma, _LEAST_OF_WAY_S)
+        found.append((told, MotionOffset(value, sigma, clear)))
+    return max(found)[1] if found else None
 
 
-def _best_lag(sums: Array, lags: Array, windows: float) -> tuple[float, float, float] | None:
-    """Return the gain in chi-square by the best offset, that offset, and its sigma, s; None if there is no best one.
+class _Lag(NamedTuple):
+    """The best offset of the stamps of a motion.
+
+    Attributes:
+        told: by how much the log-likelihood of the motion is greater with what is felt than without.
+        better: gain in chi-square over no offset. value_s, sigma_s: the offset and its sigma, s.
+    """
+
+    told: float
+    better: float
+    value_s: float
+    sigma_s: float
+
+
+def _best_lag(sums: Array, lags: Array, windows: float) -> _Lag | None:
+    """Return the best offset; None if there is none.
 
     Args:
         sums: (L, 4, 4) of `_sums`, by lag. lags: (L,), s. windows: number of independent windows in the sums.
@@ -235,7 +249,7 @@ def _best_lag(sums: Array, lags: Array, windows: float) -> tuple[float, float, f
     value = float(lags[k]) + float(c[k + 1] - c[k - 1]) / (2.0 * _APART_S * bend)
     left = max(1.0 - float(c[k]) ** 2, 1e-9)
     better = windows * (float(c[k]) ** 2 - float(np.interp(0.0, lags, c)) ** 2) / left
-    return better, value, float(np.sqrt(left / (windows * c[k] * bend)))
+    return _Lag(-0.5 * windows * float(np.log(left)), better, value, float(np.sqrt(left / (windows * c[k] * bend))))
 
 
 def later_than(fixes: MeasuredMotion, velocity: MeasuredMotion) -> tuple[float, float] | None:
@@ -316,7 +330,10 @@ def _sums(along: Array, felt: Array, swung: Array, begun: NDArray[np.int64]) -> 
 
 
 def _explained(spread: Array, held: float) -> Array:
-    """Return the multiple correlation (L,) of an acceleration with what is felt and a swing; 0 if it opposes the felt.
+    """Return the multiple correlation (L,) of an acceleration with what is felt and a swing.
+
+    Where the acceleration opposes what is felt, with the swing alone: 0 there would cut into the peak of a craft that
+    keeps its speed and sways, of which what is felt tells little either way.
 
     Args:
         spread: (L, 3, 3) sums of products of acceleration, felt and swing about their means; (L, 2, 2) without the
@@ -328,4 +345,6 @@ def _explained(spread: Array, held: float) -> Array:
     share = np.einsum("lij,lj->li", np.linalg.pinv(among, hermitian=True), by)
     if power <= 0.0:
         return np.zeros(len(spread))
-    return np.where(share[:, 0] > 0.0, np.sqrt(np.maximum((share * by).sum(axis=1), 0.0) / power), 0.0)
+    alone = (by[:, 1:] ** 2).sum(axis=1) / np.maximum(among[:, 1:, 1:].sum(axis=(1, 2)), np.finfo(float).tiny)
+    explained = np.where(share[:, 0] > 0.0, (share * by).sum(axis=1), alone)
+    return np.asarray(np.sqrt(np.maximum(explained, 0.0) / power))

@@ -147,6 +147,27 @@ def test_velocity() -> None:
     np.testing.assert_allclose(decode(MAKE.twist(T, (32.768, 1, 0)), VelocityConfig()).v_enu_mps, [32.768, 1, 0])
 
 
+@pytest.mark.parametrize("up", [0.0, -0.0, np.nan])
+def test_a_velocity_whose_up_is_0_is_horizontal(up: float) -> None:
+    """As nmea_navsat_driver makes it of RMC, whatever its covariance: no receiver measures exactly 0.
+
+    Taken for measured, a boat in a swell of 0.8 m was 4.7 m off at a bound of 4.6 m, its IMU accused.
+    """
+    cov = np.diag([0.04, 0.09, 0.0025, 1.0, 1.0, 1.0])
+    cov[0, 2] = cov[2, 0] = 0.001
+    for msg, own in ((MAKE.twist(T, (1, 2, up), cov), (0.04, 0.09)), (MAKE.twist(T, (1, 2, up)), (0.09, 0.09))):
+        v = decode(msg, VelocityConfig())
+        assert isinstance(v, GnssVelocity)
+        np.testing.assert_allclose(v.v_enu_mps, [1, 2, 0])
+        np.testing.assert_allclose(v.cov_m2ps2[:2, :2], np.diag(own))
+        assert v.cov_m2ps2[2, 2] > 1e4
+        assert not v.cov_m2ps2[2, :2].any()
+    ned = decode(MAKE.twist(T, (1, 2, up), cov), VelocityConfig(convention="ned"))
+    assert ned.cov_m2ps2[2, 2] > 1e4
+    told = decode(MAKE.twist(T, (1, 2, 0.01), np.diag(cov.diagonal())), VelocityConfig())
+    assert told.cov_m2ps2[2, 2] == pytest.approx(0.0025)
+
+
 def test_velocity_in_north_east_down() -> None:
     """East is the second, north the first, up the third turned round; so are the covariances, of north with down too."""
     cov = np.zeros((6, 6))

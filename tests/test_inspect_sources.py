@@ -195,6 +195,48 @@ def test_a_yaw_that_windows_of_other_lengths_have_elsewhere_is_not_clear(tmp_pat
     assert "not clearly" in mount.evidence
 
 
+def crossing(make: Messages, legs_s: float) -> list[Item]:
+    """At 2.5 to 3.5 m/s, set by 1.5 m/s to port whichever way she goes, which is every `legs_s` the other way; a true compass."""
+    rng, t = np.random.default_rng(1), np.arange(0.0, 240.0, 0.02)
+    yaw = 0.3 + 0.1 * np.sin(t / 6.0) + np.pi / 2.0 * (1.0 + np.tanh((t % (2.0 * legs_s) - legs_s) / 3.0))
+    over = (3.0 + 0.5 * np.sin(t / 3.0) + 1.5j) * np.exp(1j * yaw)
+    felt, rate = np.gradient(over, t) * np.exp(-1j * yaw), np.gradient(yaw, t)
+    way = np.cumsum(over) * 0.02
+    lla = DATUM.geodetic_from_enu(np.column_stack([way.real, way.imag, 0.0 * t]))
+    accel = np.column_stack([felt.real, felt.imag, 9.81 + 0.0 * t]) + 0.05 * rng.normal(size=(len(t), 3))
+    items: list[Item] = []
+    for k in range(len(t)):
+        stamp = START_NS + k * S // 50
+        items.append(("/imu", stamp, make.imu(stamp, accel[k], (0.0, 0.0, rate[k]))))
+        if k % 10 == 0:
+            items.append(("/fix", stamp, make.fix(stamp, *lla[k])))
+            items.append(
+                ("/heading", stamp, make.compass(stamp, (0.0, 0.0, np.sin(yaw[k] / 2.0), np.cos(yaw[k] / 2.0))))
+            )
+    return items
+
+
+def test_a_course_that_goes_one_way_tells_no_angle_of_imu_or_compass(tmp_path: Path) -> None:
+    """In a current across, course and heading differ by 27 deg all along: taken for the mounts of both, it made the heading as wrong, at a bound of 12.
+
+    To and fro, no current does that: then both do sit askew.
+    """
+    for legs_s, set_sideways in ((1e3, True), (60.0, False)):
+        _, config, text = look(tmp_path / f"{legs_s:.0f}", crossing(Messages(2), legs_s), Messages(2))
+        imu, compass = config.sensors["imu"], config.sensors["compass"]
+        assert isinstance(imu, ImuConfig)
+        assert isinstance(compass, CompassConfig)
+        yaw_deg = 0.0 if set_sideways else -27.0
+        assert imu.mount.rpy_deg[2] == pytest.approx(yaw_deg, abs=2.0)
+        assert compass.mount.rpy_deg[2] == pytest.approx(yaw_deg, abs=2.0)
+        assert ("she goes one way, so leeway or a current may set her by that" in text) == set_sideways
+        if set_sideways:  # what no course tells is in the bounds
+            assert 1.96 * imu.mount_sigma_deg > 27.0
+            assert 1.96 * compass.mount_offset_sigma_deg > 27.0
+        else:
+            assert imu.mount_sigma_deg < 5.0
+
+
 @pytest.mark.parametrize(("yaw_deg", "said"), [(0.0, False), (-84.0, True)])
 def test_an_imu_that_sits_a_little_askew_is_said(yaw_deg: float, said: bool, tmp_path: Path) -> None:
     """Drafted as a quarter turn, since leeway would look alike; nothing said that the heading is off by the rest."""

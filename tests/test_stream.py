@@ -52,7 +52,7 @@ IMU: dict[str, Any] = {"type": "imu", "stamp": "5", "accel_mps2": [0, 0, 9.81], 
 FIX: dict[str, Any] = {"type": "gnss", "stamp": "5", "lat_deg": 57.7, "lon_deg": 11.9, "height_m": 2.0}
 POSE: dict[str, Any] = {"type": "pose", "stamp": "5", "modes": [{"xyz_m": [1, 2, 3], "rpy_deg": [0, 0, 90]}]}
 HEADING: dict[str, Any] = {"type": "heading", "stamp": "5", "heading_deg": 30.0}
-VELOCITY: dict[str, Any] = {"type": "velocity", "stamp": "5", "v_enu_mps": [1, 2, 0]}
+VELOCITY: dict[str, Any] = {"type": "velocity", "stamp": "5", "v_enu_mps": [1, 2, -0.5]}
 VALID = [IMU, FIX, POSE, HEADING, VELOCITY, {"type": "predict"}]
 
 
@@ -136,9 +136,12 @@ def test_configured_sigma_goes_first_where_the_reported_one_is_not_believed() ->
 def test_velocity() -> None:
     m = said(VELOCITY)
     assert isinstance(m, GnssVelocity)
-    np.testing.assert_array_equal(m.v_enu_mps, [1, 2, 0])
+    np.testing.assert_array_equal(m.v_enu_mps, [1, 2, -0.5])
     np.testing.assert_allclose(m.cov_m2ps2, 0.09 * np.eye(3))
     np.testing.assert_allclose(said({**VELOCITY, "sigma_mps": [0.1, 0.2, 0.3]}).cov_m2ps2, np.diag([0.01, 0.04, 0.09]))
+    level = said({**VELOCITY, "v_enu_mps": [1, 2, 0], "sigma_mps": [0.1, 0.2, 0.3]}).cov_m2ps2  # as in a bag: not told
+    np.testing.assert_allclose(level[:2, :2], np.diag([0.01, 0.04]))
+    assert level[2, 2] > 1e4
 
 
 def test_pose_with_modes() -> None:

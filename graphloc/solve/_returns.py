@@ -26,7 +26,7 @@ from graphloc.time import NS_PER_S, duration_ns, stamps_of, utc_text
 _CONVERGES_S = 60.0  # length of the time after an outage in which fixes are doubted
 _CONVERGED = 0.75  # share of that time in which the receiver must have converged
 _STILL = 1.5  # fixes are left out for so many times as long as they are far off, as the error fades slowly
-_RIGHT = 1.5  # nats that a right fix costs at least: half of its axes
+_RIGHT = 1.5  # nats that a right fix costs by what it states: half of its axes
 _FAR = 2.0  # sigmas, of fix and slow error, off the track: a fix that is nearer has converged
 
 
@@ -58,7 +58,9 @@ class Returns(NamedTuple):
     """Returns of one receiver from outages.
 
     Attributes:
-        number: of its stream. usual: cost (nats) that comes with each of its other fixes. each: the returns.
+        number: of its stream. each: the returns.
+        usual: cost (nats) that comes with each of its other fixes. Most receivers state their whole error, of which what
+            changes from fix to fix is a part: of such a right fix costs less than `_RIGHT`.
     """
 
     number: int
@@ -121,7 +123,7 @@ class Returns(NamedTuple):
             float(_costs(s, without.verdicts).sum()) for s in without.problem.streams if s.number != self.number
         )
         left = len(self._stream(without.problem).measurements)
-        return Returns(self.number, max((cost - others) / left, _RIGHT), tuple(found))
+        return Returns(self.number, max((cost - others) / left, self.usual), tuple(found))
 
 
 def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Returns | None:
@@ -137,8 +139,10 @@ def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Retu
     if len(absolute) != 1 or absolute[0].row.has_hypotheses or len(absolute[0].position_jumps[0]):
         return None
     (stream,) = absolute
-    cost = _costs(stream, solved.verdicts)
+    cost, every = _costs(stream, solved.verdicts), _returns(stream)
     least = COMES_BACK_OFF * max(misfit, 1.0)
+    others = np.delete(cost, [i for one in every for i in one.fixes])
+    usual = min(float(others.mean()), _RIGHT) if len(others) else _RIGHT
 
     def may_be_off(one: Return) -> bool:
         end_ns = stream.measurements[one.fixes[-1]].stamp_ns
@@ -146,11 +150,11 @@ def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Retu
             return False  # the IMU was wrong there, and may still be
         steps = range(problem.timeline.floor(one.outage_ns[0]), int(stream.state[one.fixes[-1]]))
         bent = sum(problem.inertial[k].error(solved.values) for k in steps)
-        dear = bent + float(np.sum(cost[one.fixes] - _RIGHT)) > least
+        dear = bent + float(np.sum(cost[one.fixes] - usual)) > least
         return dear or any(far_sigmas(stream.slow, solved.verdicts[stream.number, i].at) > _FAR for i in one.fixes)
 
-    returns = tuple(filter(may_be_off, _returns(stream)))
-    return Returns(stream.number, _RIGHT, returns) if returns else None
+    returns = tuple(filter(may_be_off, every))
+    return Returns(stream.number, usual, returns) if returns else None
 
 
 def _returns(stream: Stream) -> list[Return]:
