@@ -106,7 +106,7 @@ class HoldOut:
         full = {n for m in held for n in self._gaps_of(m, fixes)}
         if len(full) == self.gaps:
             return []
-        said = f"{self}: {self.gaps - len(full)} of the gaps lie where there are no fixes anyway"
+        said = f"{self}: no fixes in {self.gaps - len(full)} of the gaps anyway"
         return [f"{said}: the error is that of the other {len(full)}"]
 
     def _holds(self, i: int, m: GnssPosition, fixes: list[GnssPosition]) -> bool:

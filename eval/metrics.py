@@ -49,6 +49,8 @@ class Table:
 
     def told(self) -> list[tuple[str, tuple[float | None, ...]]]:
         """Return each column with its values, by row; without those that have none."""
+        if not self.rows:
+            return []
         values = zip(*(values for _, values in self.rows), strict=True)
         told = zip(self.columns, values, strict=True)
         return [(column, found) for column, found in told if any(value is not None for value in found)]
@@ -121,7 +123,7 @@ def common_stamps(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.i
     covered = estimate.covers(truth.stamps_ns)
     if not covered.any():
         raise NoCommonTimeError(
-            f"the track ({_when(estimate)}) and the truth ({_when(truth)}) share no time: check the stamps of truth_topic, and "
+            f"the track ({_when(estimate)}) and the truth ({_when(truth)}) share no time: check the stamps of the truth, and "
             "truth_time_offset_s"
         )
     return truth.stamps_ns[covered], float(covered.mean())
@@ -364,9 +366,7 @@ def held_out_table(
     note = "the fixes' own noise is part of the error; gaps lack GNSS velocities, too"
     kept = {name for name, row in rows if row.fix_rmse_m is not None}
     if kept and len(kept) < len(rows):  # a row of dashes but for one
-        note += (
-            f"; fix_rmse_m takes off the receiver's slow error over time, which only {' and '.join(sorted(kept))} keeps"
-        )
+        note += f"; fix_rmse_m takes off the receiver's slow error over time, kept only by {' and '.join(sorted(kept))}"
     return _table("Against held-out fixes", rows, note)
 
 

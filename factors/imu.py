@@ -43,6 +43,9 @@ from graphloc.time import duration_ns
 
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # white noise of unknown motion in a gap
 _SHORT_S = 2.0  # longest gap that is interpolated linearly; none is so short in which an IMU is switched off and on
+# Silences are kept for so long after the samples about them: it is asked how far a bias has gone since then (`judge.bias_walk`, by a
+# quarter of an hour).
+_SILENT_KEPT_S = 1000.0
 _STALLS_S = 10.0  # longest pause of all sensors that is taken for a recorder's and not for a power cycle; a choice
 _ANEW = 0.25  # of the turn-on bias, by which it differs from one time to the next; a choice
 _FORGET_S, _AROUND_S = 1.0, 10.0  # decay of the last sample in a gap; length of the means on either side
@@ -112,7 +115,7 @@ class Links:
     def forget(self, before_ns: int) -> None:
         """Drop the samples before a stamp, except the last of them and those that the bridge of a gap after it needs."""
         self._left_out = [gap for gap in self._left_out if gap[1] >= before_ns]
-        self._silent = self._silent[self._silent[:, 1] >= before_ns]
+        self._silent = self._silent[self._silent[:, 1] >= before_ns - duration_ns(_SILENT_KEPT_S)]
         before_ns = min([before_ns, *(a - duration_ns(_AROUND_S) for a, _ in self._left_out)])
         first = max(int(np.searchsorted(self._stamps, before_ns)) - 1, 0)
         self._stamps, self._samples = self._stamps[first:].copy(), self._samples[first:].copy()

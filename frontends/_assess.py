@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import GnssConfig, SlowErrorConfig
-from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic, wrap_angle
 from graphloc.frontends import _clock
 from graphloc.frontends._fixes import RTK_SIGMA_M, radians_warning, scatter_m, stored, stored_warning, uneven
 from graphloc.frontends._reports import GnssReport, PartOfFixes, TopicReport, Vec, of_nmea
@@ -26,7 +26,7 @@ from graphloc.signals.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.signals.white_noise import white_noise
 from graphloc.time import NS_PER_S, stamps_of
 
-_STRAIGHT_DEG = 20.0  # 1 sigma of courses that go one way; a choice
+_MOST, _ONE_WAY_RAD = 0.8, np.radians(30.0)  # so many courses lie so near to their mean where they go one way; a choice
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
 _EITHER = 0.01  # least share of RTK fixes, and of others, of a receiver that has RTK by turns
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
@@ -63,13 +63,15 @@ class Courses:
     course_rad: Array
 
 
-def nearly_straight(course_rad: Array) -> bool:
-    """Return whether courses (N,), rad, go one way.
+def one_way(course_rad: Array) -> bool:
+    """Return whether most courses (N,), rad, go one way.
 
-    Such courses tell neither the convention of a heading nor, to less than leeway and current, its offset.
+    Then leeway or a current may keep the heading off them by the same all along; of those to several sides the offsets differ.
     """
-    mean = max(abs(np.exp(1j * course_rad).mean()), 1e-9)
-    return float(np.degrees(np.sqrt(max(0.0, -2.0 * np.log(mean))))) < _STRAIGHT_DEG
+    if not len(course_rad):
+        return False
+    off = np.abs(wrap_angle(course_rad - np.angle(np.exp(1j * course_rad).sum())))
+    return bool(np.quantile(off, _MOST) < _ONE_WAY_RAD)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array, wrap_angle
-from graphloc.frontends._assess import Courses, nearly_straight, sane
+from graphloc.frontends._assess import Courses, one_way, sane
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, two_antennas
 from graphloc.frontends._streams import TopicData
@@ -23,6 +23,7 @@ _FEWEST, _FEWEST_COURSES = 10, 20
 _TURNS_DEG, _SAME_DEG = 5.0, 0.2  # two topics are one heading if it turns by more than this, and they differ by less
 _DELAYS_S = np.arange(-50, 51) / 100.0  # delays that are tried between two topics of one heading
 _MOST_COMPARED = 5000  # most headings of a run that are compared
+_STRAIGHT_DEG = 20.0  # courses that turn by less tell no convention
 _GAP_S, _GAP = 2.0, 3.0  # a gap in headings is longer than this, and than so many times the median interval
 _ASKEW_DEG = 15.0  # two antennas lie along the vessel or athwart, within this
 # Blocks whose median is taken: waves and short turns average out, and a minute and a half tells a wander; a choice.
@@ -121,7 +122,7 @@ def _by_courses(
         usable=fit.good or sideways,
         convention=fit.convention,
         scatter_deg=fit.scatter_deg,
-        straight=fit.straight,
+        one_way=one_way(courses.course_rad),
         samples=len(fit.apart_rad),
         why=_why(fit, known, sideways=sideways),
     )
@@ -198,7 +199,8 @@ def _beside_courses(stamps_ns: NDArray[np.int64], angle: Array, courses: Courses
     measured = np.interp((courses.stamps_ns - origin) / NS_PER_S, (stamps_ns - origin) / NS_PER_S, angle)
     apart = {convention: in_enu(measured, convention) - courses.course_rad for convention in ("enu", "ned")}
     fits = {convention: _beside_either_way(off) for convention, off in apart.items()}
-    straight = nearly_straight(courses.course_rad)
+    turned = float(np.degrees(np.sqrt(max(0.0, -2.0 * np.log(max(abs(np.exp(1j * courses.course_rad).mean()), 1e-9))))))
+    straight = turned < _STRAIGHT_DEG
 
     def unlikely(convention: str) -> tuple[float, ...]:
         offset_deg, scatter_deg, _ = fits[convention]

@@ -266,10 +266,10 @@ def _mount_yaw(levelled: _Samples, motions: Sequence[MeasuredMotion]) -> tuple[f
         return None, None, f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
     off_deg = abs(found.yaw_deg - quarter)
     turned = off_deg > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
-    askew = turned and not found.straight
+    askew = turned and not found.one_way
     yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter)))) + 0.0
     said = f"yaw by the motion of {found.source}: {found.yaw_deg:z.0f} deg (coherence {found.coherence:.2f})"
-    if turned and found.straight:
+    if turned and found.one_way:
         said += (
             f", taken as {yaw:.0f}: she goes one way, so leeway or a current may set her by that; where she is not set sideways, as "
             f"on wheels, set {found.yaw_deg:.0f}"

@@ -245,7 +245,7 @@ def _mount_lines(compass: CompassReport) -> list[str]:
         if yaw % 90.0:  # if a vessel is set to either side by turns, the mean course is no better than its scatter
             sigma = max(_LEEWAY_DEG, compass.scatter_deg or 0.0)
         why = "the course differs from the heading by leeway, so it shows no more than that"
-        if compass.straight:
+        if compass.one_way:
             why = f"{compass.offset_deg:+.0f} deg off the course, one way all along: leeway, a current, declination or the mount"
         astern = ", unless the vessel goes astern most of the time: then 0" if compass.backwards else ""
         lines.append(

@@ -17,7 +17,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Slerp
 
 from graphloc.frames import Array, wrap_angle
-from graphloc.frontends._assess import MeasuredMotion, nearly_straight
+from graphloc.frontends._assess import MeasuredMotion, one_way
 from graphloc.frontends.turning import Turning
 from graphloc.signals.series import integral
 from graphloc.time import NS_PER_S
@@ -45,7 +45,7 @@ class YawInCraft:
     Attributes:
         source: of the motion. yaw_deg: from the craft's forward to the sensor's x, positive to port.
         coherence: how clear it is, 0 to 1. chance: the coherence that chance gives.
-        straight: whether it is by courses that go one way, from which leeway or a current may keep the heading.
+        one_way: whether it is by courses most of which go one way, from which leeway or a current may keep the heading.
         differs_deg: by how much the yaw differs by other motions or windows that are nearly as coherent, at most.
     """
 
@@ -53,7 +53,7 @@ class YawInCraft:
     yaw_deg: float
     coherence: float
     chance: float
-    straight: bool = False
+    one_way: bool = False
     differs_deg: float = 0.0
 
     @property
@@ -170,6 +170,8 @@ def yaw_in_craft(
         return None
     best = max(tried, key=lambda found: found.coherence / found.chance)
     as_coherent = [found for found in tried if found.clear and found.coherence > _AS_COHERENT * best.coherence]
+    # Of wheels no current tells another yaw.
+    best = next((found for found in as_coherent if not found.one_way), best) if best.one_way else best
     others = np.radians([found.yaw_deg - best.yaw_deg for found in as_coherent])
     return replace(best, differs_deg=float(np.degrees(np.abs(wrap_angle(others)).max(initial=0.0))))
 
@@ -219,9 +221,9 @@ def _yaw_by(felt: Felt, motion: MeasuredMotion, half_s: float) -> YawInCraft | N
         heads = np.exp(1j * np.interp(middle, at, np.unwrap(motion.attitude.as_euler("ZYX")[:, 0])))
     else:
         heads = faced if motion.way_m is None else chord / np.maximum(np.abs(chord), MOVES_M)
-    straight = motion.attitude is None and motion.way_m is not None and nearly_straight(np.angle(chord[good]))
+    set_off = motion.attitude is None and motion.way_m is not None and one_way(np.angle(chord[good]))
     m, f = (moved * np.conj(heads))[good], (f * np.conj(faced))[good]
-    return replace(_turn_between(motion.source, f, m, windows), straight=straight)
+    return replace(_turn_between(motion.source, f, m, windows), one_way=set_off)
 
 
 def _yaw_by_tipping(felt: Felt, gyro: Array, motion: MeasuredMotion) -> YawInCraft | None:

@@ -277,7 +277,7 @@ class CompassReport:
         leeway_deg: how far the offset wanders from half minute to half minute, by leeway or the compass; None if
             unknown. Of a vessel that is set sideways, this and the offset are None, unless two antennas are mounted
             athwart.
-        straight: whether the courses go one way: then leeway or a current may make any offset, all along.
+        one_way: whether most courses go one way: then leeway or a current may make any offset, all along.
         samples: number of courses compared. why: the judgement in words. unit: of bare numbers; else None.
         like: an orientation of the same device that says the same; else ''.
         wander_deg: wander of its error beside the gyroscope, 1 sigma in a minute; None if that is not told.
@@ -300,7 +300,7 @@ class CompassReport:
     unit: str | None = None
     like: str = ""
     leeway_deg: float | None = None
-    straight: bool = False
+    one_way: bool = False
     wander_deg: float | None = None
     two_antennas: bool = False
     late_s: tuple[float, float] | None = None
@@ -321,7 +321,7 @@ class CompassReport:
         if self.offset_deg is None or abs(self.offset_deg) <= TURNED_DEG:
             return 0.0
         quarter = 90.0 * round(self.offset_deg / 90.0)
-        if self.straight or abs(self.offset_deg - quarter) < _ASKEW_DEG:
+        if self.one_way or abs(self.offset_deg - quarter) < _ASKEW_DEG:
             return quarter
         return float(round(self.offset_deg))
 

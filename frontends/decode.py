@@ -384,12 +384,20 @@ def _twist(msg: Any) -> tuple[tuple[float, float, float], Array]:
 
 
 def _velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
-    return _moving(*_in_enu(*_twist(msg), config), stamp_ns, seq, sensor, config)
+    return _moving(*_up_if_told(*_in_enu(*_twist(msg), config)), stamp_ns, seq, sensor, config)
 
 
 def _velocity_vector(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
     v = msg.vector
-    return _moving(*_in_enu((v.x, v.y, v.z), np.zeros((3, 3)), config), stamp_ns, seq, sensor, config)
+    return _moving(*_up_if_told(*_in_enu((v.x, v.y, v.z), np.zeros((3, 3)), config)), stamp_ns, seq, sensor, config)
+
+
+def _up_if_told(v: tuple[float, float, float], cov: Array) -> tuple[tuple[float, float, float], Array]:
+    """Return a velocity, east, north, up, and its covariance; up is NaN where it is exactly 0.
+
+    So drivers of NMEA leave it in a standard message, with any covariance. A maker's message says what its receiver measured.
+    """
+    return (*v[:2], v[2] or np.nan), cov
 
 
 def _in_enu(
@@ -435,13 +443,10 @@ def _velocity_gps_fix(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Ve
 def _moving(
     v_mps: tuple[float, float, float], cov: Array, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig
 ) -> Decoded:
-    """Return a velocity over ground, horizontal where its up is NaN or exactly 0.
-
-    No receiver measures exactly 0, but drivers of NMEA leave it so, also in a Twist, and with any covariance.
-    """
+    """Return a velocity over ground, horizontal where its up is NaN."""
     value = np.array(v_mps, dtype=float)
     default = np.full(3, config.default_sigma_mps**2)
-    if value[2] == 0.0 or np.isnan(value[2]):
+    if np.isnan(value[2]):
         value[2], default[2] = 0.0, _NO_CLIMB_MPS2
         cov = cov.copy()
         cov[2], cov[:, 2] = 0.0, 0.0

@@ -33,7 +33,7 @@ def read_tum(path: Path, offset_s: float = 0.0) -> Trajectory:
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path}: larger than {_MOST_BYTES >> 20} MiB")
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); `truth_file` names it") from None
     except UnicodeDecodeError:

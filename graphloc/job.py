@@ -116,6 +116,7 @@ def check(jobs: Sequence[Job]) -> None:
             continue
         config = app.configured(Path(job.config), _values(job.config_changes))
         check_bag([Path(job.bag)], config)
+        app.truth_of_file(job.config, config)
         if not (config.truth or config.check_speed_topic or job.hold_out):
             raise ConfigError(
                 f"{job.config}: no truth_topic or truth_file, so nothing would be measured: give --hold-out, as gaps:8x10"

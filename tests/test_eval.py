@@ -131,7 +131,7 @@ def test_a_gap_where_there_are_no_fixes_anyway_is_said_not_to_count() -> None:
     kept, held = HoldOut.parse("gaps:2x10").split(heard)
     assert min(m.stamp_ns for m in held) > silent[1]
     (said,) = set(kept.warnings) - set(heard.warnings)
-    assert said.startswith("--hold-out gaps:2x10: 1 of the gaps ")
+    assert said.startswith("--hold-out gaps:2x10: no fixes in 1 of the gaps ")
     assert said.endswith("of the other 1")
     assert HoldOut.parse("gaps:2x10").split(run.recording)[0].warnings == run.recording.warnings
 
@@ -257,7 +257,7 @@ def test_a_track_apart_from_a_drifting_receiver_predicts_its_fixes() -> None:
     untold = metrics.held_out_table([("ours", track)], held, datum, metrics.Antennas(configured=levers), {})
     assert "fix_rmse_m" not in untold.as_text()  # a row of dashes alone
     assert untold.as_dict()["ours"]["fix_rmse_m"] is None
-    assert table.note.endswith("; fix_rmse_m takes off the receiver's slow error over time, which only ours keeps")
+    assert table.note.endswith("; fix_rmse_m takes off the receiver's slow error over time, kept only by ours")
 
 
 def test_forward_speed_by_hand() -> None:
@@ -330,7 +330,7 @@ def test_the_filter_of_the_thesis_says_why_a_gyroscope_turns_it_away(bias_radps:
     beside = metrics.compare_to_truth(found.trajectory, run.truth).heading_rmse_deg
     assert ("no state for the gyroscope's bias" in found.why) == off
     if off:  # the compass's own error is a degree or two
-        said = re.match(r"its heading is (\d+) deg \(RMS\) off the headings that it is given", found.why)
+        said = re.match(r"its heading is (\d+) deg \(median\) off the headings that it is given", found.why)
         assert said
         assert float(said[1]) == pytest.approx(beside, abs=3.0)
     else:

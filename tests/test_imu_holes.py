@@ -261,6 +261,8 @@ def test_after_a_silence_the_biases_may_be_others(silent_s: float) -> None:
     for link in (links, grown):
         assert variance(link, 9.0, 14.0) == pytest.approx(expected, rel=1e-6)
         assert variance(link, 9.0, 11.0) + variance(link, 11.0, 14.0) == pytest.approx(expected, rel=1e-6)
+        link.forget(18 * S)  # the window has passed it, but how far a bias has gone in a minute is still asked
+        assert variance(link, 9.0, 14.0) == pytest.approx(expected, rel=1e-6)
     links.pause(10 * S, int((10.0 + silent_s) * S))  # of all sensors: the recorder's
     assert variance(links, 9.0, 14.0) == pytest.approx(walk, rel=1e-6)
 

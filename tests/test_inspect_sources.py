@@ -221,7 +221,8 @@ def test_a_course_that_goes_one_way_tells_no_angle_of_imu_or_compass(tmp_path: P
 
     To and fro, no current does that: then both do sit askew.
     """
-    for legs_s, set_sideways in ((1e3, True), (60.0, False)):
+    # 230 s: she turns at the end, and goes the other way for 10 s of 240.
+    for legs_s, set_sideways in ((1e3, True), (230.0, True), (60.0, False)):
         _, config, text = look(tmp_path / f"{legs_s:.0f}", crossing(Messages(2), legs_s), Messages(2))
         imu, compass = config.sensors["imu"], config.sensors["compass"]
         assert isinstance(imu, ImuConfig)

@@ -71,6 +71,14 @@ def test_nothing_is_said_of_one_that_fits_as_stamped(by_s: float) -> None:
     assert clock_apart(track, later(truth, by_s)) is None
 
 
+@pytest.mark.parametrize(("by_s", "of_clock"), [(0.8, False), (18.0, True)])
+def test_a_second_may_be_a_sensor_that_is_late(by_s: float, of_clock: bool) -> None:
+    apart = clock_apart(track_of(0.0, 200.0, 10.0, 0.05), later(track_of(3.0, 190.0, 20.0, 0.01, 1), by_s))
+    assert apart is not None
+    assert apart.of_clock is of_clock
+    assert ("time_offset_s` of gnss" in apart.said("/truth", 0.0)) is not of_clock
+
+
 def test_nothing_is_said_where_the_motion_does_not_show_it() -> None:
     """At rest; on a straight course; on rounds of a minute, which are alike a minute later; of a track that goes elsewhere."""
     track = track_of(0.0, 200.0, 10.0)
@@ -83,6 +91,7 @@ def test_nothing_is_said_where_the_motion_does_not_show_it() -> None:
     ):
         one, other = (replace(track, v_world_mps=velocity + 0.05 * rng.normal(size=velocity.shape)) for _ in range(2))
         assert clock_apart(one, other) is None
+    assert clock_apart(one, later(other, 18.0)) is None  # it was said to be 78 s, or any other number of rounds
     assert track.v_world_mps is not None
     turned = Rotation.from_euler("z", 70.0, degrees=True).apply(track.v_world_mps)
     assert clock_apart(track, later(replace(track, v_world_mps=turned), 18.0)) is None

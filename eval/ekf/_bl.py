@@ -13,9 +13,8 @@ from graphloc.eval.ekf._planar import SILENT_Q, FilterResult, advance, run_filte
 from graphloc.frames import Array, Datum
 from graphloc.measurements import BodyVelocity, GnssPosition, GnssVelocity, Measurement, PoseFix
 from graphloc.recording import Recording
-from graphloc.signals.series import rms
 
-_FAR_OFF_DEG = 5.0  # RMS, several times the noise of any heading sensor that a filter is given
+_FAR_OFF_DEG = 5.0  # median, which the noise of no heading sensor makes; a choice
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,11 +88,12 @@ def run_bl(recording: Recording, config: VesselConfig, datum: Datum, options: Bl
     """Run BL alg. 6. It does not use GNSS velocity."""
     filtered = _BlEkf(options := options or BlConfig())
     result = run_filter(filtered, recording, config, datum)
-    off_deg = float(np.degrees(rms(np.array(filtered.heading_off_rad or [0.0]))))
+    # The median, as a bias turns it to one side: noise and single wrong headings do not.
+    off_deg = abs(float(np.degrees(np.median(filtered.heading_off_rad or [0.0]))))
     if off_deg < _FAR_OFF_DEG:
         return result
     why = (
-        f"its heading is {off_deg:.0f} deg (RMS) off the headings that it is given: as printed it has no state for the gyroscope's bias, and "
+        f"its heading is {off_deg:.0f} deg (median) off the headings that it is given: as printed it has no state for the gyroscope's bias, and "
         f"takes the gyroscope to be good to {options.gyro_noise_dps:g} deg/s"
     )
     return replace(result, why=why)

@@ -134,7 +134,8 @@ def _coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
         return
     trust, why = Trust.YES, ""
     truth = data.recording.truth
-    if covered < _COVERED and truth is not None and clock_apart(solution.trajectory, truth) is not None:
+    apart = clock_apart(solution.trajectory, truth) if covered < _COVERED and truth is not None else None
+    if apart is not None and apart.of_clock:
         trust = Trust.WITH_CARE
         why = ". That says nothing of the track: the truth is on another clock (see the warnings)"
     elif covered < _NOT_COVERED:

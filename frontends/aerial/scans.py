@@ -47,7 +47,7 @@ class ScanFeed:
         return _turns(self._bag, self._config)
 
 
-def check_bag(bags: Bags, config: AerialConfig, folder: Path, body_frame: str, datum: Datum) -> None:
+def check_scans(bags: Bags, config: AerialConfig, folder: Path, body_frame: str, datum: Datum) -> None:
     """Refuse what `match_bag` would refuse, before there is a track: its arguments but the track."""
     with Bag(bags) as bag:
         LiveMatcher(config, folder, datum, ScanFeed(bag, config, body_frame).mounts)

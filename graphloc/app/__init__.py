@@ -15,6 +15,7 @@ from graphloc.app._estimate import (
     simulated,
     smooth_recording,
     solve,
+    truth_of_file,
     with_synthetic,
 )
 from graphloc.app._run import Run, antennas
@@ -38,6 +39,7 @@ __all__ = [
     "smooth_recording",
     "solve",
     "tables",
+    "truth_of_file",
     "truth_statement",
     "with_synthetic",
     "write",

@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
+
 from graphloc import found_tags, origin
 from graphloc.app._run import Run, made_comparable
 from graphloc.config import VesselConfig, load_config
@@ -21,7 +23,7 @@ from graphloc.eval.tag_check import suspect_tags
 from graphloc.eval.underlay import underlay
 from graphloc.factors import INERTIAL, KINDS, SENSORS
 from graphloc.frames import Datum
-from graphloc.frontends.aerial import Match, check_bag, match_bag
+from graphloc.frontends.aerial import Match, check_scans, match_bag
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.part import Bags
 from graphloc.frontends.tum import read_tum
@@ -38,6 +40,7 @@ from graphloc.time import NS_PER_S, duration_ns
 from graphloc.trajectory import Trajectory
 
 _MOST_GROWN = 8  # times that scans are matched around what those within reach lead to: each carries it on for some 20 s
+_TRUTH_BEYOND_S = 60.0  # to either side of a part of a bag
 _GAINS = 0.9  # of those beyond reach, that may be left for it to be worth its time
 _FEWEST_MATCHES = 5  # used, without which a track is no better to match around than the one before
 
@@ -62,18 +65,25 @@ def load(
 ) -> tuple[Recording, VesselConfig]:
     """Read a vessel.yaml, some of its keys changed (`config.with_changes`), and the bag, or the part of it, that it describes."""
     config = configured(config_path, changes)
+    truth = truth_of_file(config_path, config)
     recording = read_recording(bags, config, progress)
-    if config.truth_file:
-        recording = replace(recording, truth=_truth_of_file(Path(config_path).parent, config, recording))
+    if truth is not None:
+        recording = replace(recording, truth=_of_the_part(truth, recording))
     return with_sightings(recording, config, bags, progress), config
 
 
-def _truth_of_file(folder: Path, config: VesselConfig, recording: Recording) -> Trajectory:
-    """Return the truth that a file holds; of a part of a bag, what lies within the part."""
-    truth = read_tum(folder / config.truth_file, config.truth_time_offset_s)
+def truth_of_file(config_path: Path | str, config: VesselConfig) -> Trajectory | None:
+    """Return the truth that a file holds; None if the configuration names none."""
+    if not config.truth_file:
+        return None
+    return read_tum(Path(config_path).parent / config.truth_file, config.truth_time_offset_s)
+
+
+def _of_the_part(truth: Trajectory, recording: Recording) -> Trajectory:
+    """Return the truth of the part of a bag that was read, and a minute more, as its clock may be another one."""
     if recording.span is None or recording.imu is None or not len(recording.imu):
         return truth
-    first_ns, *_, last_ns = recording.imu.stamps_ns
+    first_ns, last_ns = recording.imu.stamps_ns[[0, -1]] + np.array([-1, 1]) * duration_ns(_TRUTH_BEYOND_S)
     inside = (truth.stamps_ns >= first_ns) & (truth.stamps_ns <= last_ns)
     return truth.where(inside) if inside.sum() > 1 else truth
 
@@ -124,7 +134,7 @@ def smooth_recording(
     matched = scans is not None and bool(config.of_kind("aerial"))
     if scans is not None:  # not after the minutes of the first solution
         for sensor in config.of_kind("aerial").values():
-            check_bag(scans.bags, sensor, scans.folder, config.body_frame, datum)
+            check_scans(scans.bags, sensor, scans.folder, config.body_frame, datum)
     solution = solve(recording, config, datum, probe=None if matched else calibrate.PROBE, progress=progress)
     pictures: tuple[tuple[str, bytes], ...] = ()
     if scans is not None and matched:
@@ -326,7 +336,7 @@ def match_at(
         raise InputError("no sensor of kind aerial is enabled: set `enabled: true` in its block")
     (sensor, *_) = _matched_alone(config).of_kind("aerial").values()
     datum = choose_datum(recording, config)
-    check_bag(scans.bags, sensor, scans.folder, config.body_frame, datum)
+    check_scans(scans.bags, sensor, scans.folder, config.body_frame, datum)
     whole = with_synthetic(recording, config, datum)
     track = solve(whole, config, datum, progress=progress).trajectory
     span_s = (int(track.stamps_ns[-1]) - int(track.stamps_ns[0])) / 1e9

@@ -84,7 +84,9 @@ def truth_statement(run: Run) -> str:
     none = "No truth" if not run.config.truth else f"No truth ({run.config.truth} cannot be used: see the warnings)"
     said = f"{none} and no held-out fixes: nothing here measures accuracy"
     by = suggested(run.recording.of(GnssPosition))
-    return f"{said}. `graphloc compare --hold-out {by}` does." if by else f"{said}; a `truth_topic` would."
+    return (
+        f"{said}. `graphloc compare --hold-out {by}` does." if by else f"{said}; a `truth_topic` or `truth_file` would."
+    )
 
 
 def _titled(vessel: str, source: str) -> str:

@@ -94,7 +94,7 @@ class ImuNoise:
     def _too_quiet(self, lag: Lag, samples: Callable[[], ImuSeries]) -> str:
         """Raise the noise to the scatter of the samples, where the measurements are then more probable.
 
-        See `solve.imu_noise`.
+        See `judge.imu_noise`.
 
         The IMU's residuals alone do not tell it, as they do offline: in a window of seconds, the prior from earlier
         data takes up most of a misfit.

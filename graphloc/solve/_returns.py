@@ -27,6 +27,7 @@ _CONVERGES_S = 60.0  # length of the time after an outage in which fixes are dou
 _CONVERGED = 0.75  # share of that time in which the receiver must have converged
 _STILL = 1.5  # fixes are left out for so many times as long as they are far off, as the error fades slowly
 _RIGHT = 1.5  # nats that a right fix costs by what it states: half of its axes
+_FEWEST_OTHERS = 30  # fixes that tell what a right one usually costs; a choice
 _FAR = 2.0  # sigmas, of fix and slow error, off the track: a fix that is nearer has converged
 
 
@@ -142,7 +143,7 @@ def doubtful_returns(problem: Problem, solved: RunChoice, misfit: float) -> Retu
     cost, every = _costs(stream, solved.verdicts), _returns(stream)
     least = COMES_BACK_OFF * max(misfit, 1.0)
     others = np.delete(cost, [i for one in every for i in one.fixes])
-    usual = min(float(others.mean()), _RIGHT) if len(others) else _RIGHT
+    usual = min(float(others.mean()), _RIGHT) if len(others) >= _FEWEST_OTHERS else _RIGHT
 
     def may_be_off(one: Return) -> bool:
         end_ns = stream.measurements[one.fixes[-1]].stamp_ns
