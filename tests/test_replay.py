@@ -149,7 +149,12 @@ def test_ctrl_c_before_the_start_is_said_to_be_that(run: SimulatedRun) -> None:
 
 def test_compare_has_it_beside_the_filters(run: SimulatedRun, whole: Replayed, monkeypatch: pytest.MonkeyPatch) -> None:
     given = list[Recording]()
-    monkeypatch.setattr(_estimate, "replay", lambda recording, *_, **__: given.append(recording) or whole)
+
+    def known(recording: Recording, *_: object, **__: object) -> Replayed:
+        given.append(recording)
+        return whole
+
+    monkeypatch.setattr(_estimate, "replay", known)
     compared = app.simulated(run, compare=True)
     (replayed,) = given
     assert [m.seq for m in replayed.measurements if m.seq >= 0] == [m.seq for m in run.recording.measurements]

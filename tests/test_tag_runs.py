@@ -147,8 +147,13 @@ def dock(
 @cache
 def alone(compass_off_deg: float = 0.0) -> Docked:
     """A run without its tags: as it goes where all of them are refused."""
-    by_compass = lambda m: turned_compass(m, compass_off_deg) if isinstance(m, CompassHeading) else m
-    return dock(change=lambda m: None if isinstance(m, TagSighting) else by_compass(m), lasts_s=20.0, route_s=30.0)
+
+    def changed(m: Measurement) -> Measurement | None:
+        if isinstance(m, TagSighting):
+            return None
+        return turned_compass(m, compass_off_deg) if isinstance(m, CompassHeading) else m
+
+    return dock(change=changed, lasts_s=20.0, route_s=30.0)
 
 
 def said_of_refused(
