@@ -532,8 +532,8 @@ def heading_off_deg(seed: int, count: int, gaussian: bool, bearing_deg: float = 
 
 def test_many_sightings_of_a_far_tag_do_not_bend_the_heading() -> None:
     """20 m before a tag, 3 deg off its normal: each image's two poses lie some 10 deg to either side of it."""
-    by_corners = [heading_off_deg(seed, 60, False) for seed in range(3)]
-    by_modes = [heading_off_deg(seed, 60, True) for seed in range(3)]
+    by_corners = [heading_off_deg(seed, 60, False) for seed in range(2)]
+    by_modes = [heading_off_deg(seed, 60, True) for seed in range(2)]
     assert np.abs(by_corners).max() < 0.5
     assert abs(np.mean(by_corners)) < 0.3
     assert abs(np.mean(by_modes)) > 0.5
@@ -568,7 +568,7 @@ def test_edges_that_are_seen_too_far_out_explain_a_tag_that_looks_too_large(on_a
 def test_many_sightings_of_a_far_tag_do_not_make_its_distance_surer_than_its_edges_are() -> None:
     """40 m off it is 10 px wide; 0.05 px at each edge are 1 % of that, and of the distance."""
     rng, true = np.random.default_rng(4), vessel(40.0, 5.0)
-    seen = [wider(sighting(true, rng), 0.05) for _ in range(200)]
+    seen = [wider(sighting(true, rng), 0.05) for _ in range(100)]
     nearer = [Decision(mode=nearest_mode(m.modes, true.rotation().matrix() @ AHEAD)) for m in seen]
     attitude = gtsam.PriorFactorPose3(1, true, gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-4] * 3 + [30.0] * 3)))
     edges = gtsam.PriorFactorVector(3, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, FIXED.edge_sigma_px))

@@ -54,7 +54,7 @@ def test_tags_stand_where_they_are_to_a_tenth_of_a_pixel(detector: Detector) -> 
     run, camera = docking("optimal")
     K = run.rig.cameras["camera"].K
     off, wrong_m, ranges = [], [], []
-    for k, t in enumerate(np.arange(40.0, 100.0, 4.0)):
+    for k, t in enumerate(np.arange(40.0, 100.0, 7.0)):
         near = {n: pose for n, pose in camera.tag_poses(float(t)).items() if n < 230 and 2.0 < pose[0][2] < 12.0}
         true = {n: seen_from(*pose, K) for n, pose in near.items()}
         whole = [n for n, px in true.items() if px.min() >= 20.0 and (px <= np.array([2188.0, 1222.0])).all()]
@@ -71,11 +71,11 @@ def test_tags_stand_where_they_are_to_a_tenth_of_a_pixel(detector: Detector) -> 
             both = [-cv2.Rodrigues(a)[0].T @ b[:, 0] + R.T @ p for a, b in zip(turns, places, strict=True)]
             wrong_m.append(min(np.linalg.norm(e) for e in both))
             ranges.append(np.linalg.norm(p))
-    assert len(off) > 25
+    assert len(off) > 14
     assert np.abs(np.mean(off, axis=0)).max() < 0.06  # no corner leans anywhere
     assert np.sqrt(np.mean(np.square(off))) < 0.12
     close = np.array(ranges) < 5.0
-    assert close.sum() > 10
+    assert close.sum() > 5
     assert np.quantile(np.array(wrong_m)[close], 0.95) < 0.10
 
 
@@ -187,7 +187,7 @@ def test_darkness_costs_light_and_gains_noise_and_drops_hide(detector: Detector)
     assert burnt["counterlight"] > 5.0 * burnt["optimal"] + 0.005  # the sun, and its glitter on the water
     _, wet = docking("droplet")
     hidden: set[frozenset[int]] = set()
-    for k, t in enumerate(np.arange(38.0, 100.0, 2.0), 4):  # drops come and go: until one hid a tag, and none did
+    for k, t in enumerate(np.arange(38.0, 100.0, 4.0), 4):  # drops come and go: until one hid a tag, and none did
         hidden.add(frozenset(detected(detector, wet.take(float(t), k).pixels)))
         if {226, 227, 228} in hidden and len(hidden) > 1:
             break
@@ -227,7 +227,7 @@ def test_motion_smears_by_its_length() -> None:
 @pytest.mark.parametrize("rig", ["tiara", "launch"])
 def test_what_is_beside_the_view_neither_smears_nor_shows(rig: str) -> None:
     """A tag abeam, level with the lens: its projection is nonsense, and with distortion anything at all."""
-    run = simulate(find_scenario("bl1-drift", {"rig": rig, "camera_hz": "1"}), 3)
+    run = simulate(find_scenario("bl1-drift", {"rig": rig, "camera_hz": "1", "imu_hz": "10"}), 3)
     camera = halved(run)
     abeam = [
         t
@@ -236,12 +236,12 @@ def test_what_is_beside_the_view_neither_smears_nor_shows(rig: str) -> None:
         if 0.2 < p[2] < 0.1 * abs(p[0])
     ]
     assert abeam
-    for t in abeam[::4]:
+    for t in abeam[::8]:
         assert camera.take(float(t), 0).blur_px < 1.5
 
 
 def test_an_image_depends_on_its_time_alone() -> None:
-    run, another = (simulate(find_scenario("dock-fixed-droplet", {}), seed) for seed in (1, 2))
+    run, another = (simulate(find_scenario("dock-fixed-droplet", {"imu_hz": "10"}), seed) for seed in (1, 2))
     one = halved(run)
     one.take(30.0, 150)
     seen = one.take(60.0, 300).pixels
@@ -250,7 +250,7 @@ def test_an_image_depends_on_its_time_alone() -> None:
 
 
 def test_two_cameras_share_the_sun_and_no_noise() -> None:
-    run = simulate(find_scenario("dock-fixed-counterlight", {}), 1)
+    run = simulate(find_scenario("dock-fixed-counterlight", {"imu_hz": "10"}), 1)
     mount = run.rig.cameras["camera"]
     twins = {"a": mount, "b": mount.model_copy(update={"width_px": 1000})}
     run = replace(run, rig=run.rig.model_copy(update={"cameras": {**twins, "c": mount}}))

@@ -179,7 +179,7 @@ def test_corners_are_where_the_bag_alone_says(tmp_path: Path, detector: Detector
         with (tmp_path / f"{name}.yaml").open("w") as stream:
             yaml.dump(block, stream)
     changes = {
-        "harbour": str(tmp_path / "harbour.yaml"), "rig": str(tmp_path / "rig.yaml"), "camera_hz": "1.5", "lidar_hz": "0.3",
+        "harbour": str(tmp_path / "harbour.yaml"), "rig": str(tmp_path / "rig.yaml"), "camera_hz": "1", "lidar_hz": "0.3",
         "tide_m": "0.6", "duration_s": "12", "route_s": "12",
     }  # fmt: skip
     run = replace(simulate(find_scenario("bl1-clean", changes), 2))
@@ -243,7 +243,7 @@ def test_corners_are_where_the_bag_alone_says(tmp_path: Path, detector: Detector
                 v = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
                 expected = np.column_stack([u, v]) @ info.k.reshape(3, 3)[:2, :2].T + info.k.reshape(3, 3)[:2, 2]
                 off[number].append(float(np.abs(corners - expected).max()))
-    assert min(len(o) for o in off.values()) > 10
+    assert min(len(o) for o in off.values()) > 6
     # A surveyor's 1 cm at 9 m is 0.7 px, and it can be three times that; a wrong link in the chain is tens.
     assert np.mean([v for o in off.values() for v in o]) < 1.0
     assert max(max(o) for o in off.values()) < 2.2
@@ -305,12 +305,12 @@ def test_the_long_run_has_all_of_it() -> None:
 def test_another_rig_sees_with_its_own_eyes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["dock-fixed-optimal", "--rig", "launch", "--set", "duration_s=12", "--set", "camera_hz=0.5"]
+    arguments = ["dock-fixed-optimal", "--rig", "launch", "--set", "duration_s=6", "--set", "camera_hz=0.5"]
     assert called(monkeypatch, "simulate", *arguments, "-o", tmp_path / "out") == 0
     with AnyReader([Path(capsys.readouterr().out.split("\n")[0])]) as reader:
         counts = {c.topic: c.msgcount for c in reader.connections}
-    assert counts["/mast/points"] == 11
-    assert counts["/bow/image_raw/compressed"] == counts["/bow/camera_info"] == 5
+    assert counts["/mast/points"] == 5
+    assert counts["/bow/image_raw/compressed"] == counts["/bow/camera_info"] == 2
     assert "/matcher/pose" not in counts
     vessel = YAML(typ="safe").load((tmp_path / "out/vessel.yaml").read_text())
     assert vessel["sensors"]["imu"]["mount"]["rpy_deg"] == [180.0, 0.0, 0.0]

@@ -5,6 +5,7 @@ import re
 import runpy
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,15 +24,24 @@ ELSEWHERE = {"stream_client.py"}  # in test_stream.py; kitti/make_bag.py in test
 HERE = {"compare_in_memory.py", "online_loop.py", "smooth_a_bag.py", "use_a_new_sensor.py"}
 
 
-def lighter(name: str, changes: dict[str, str]) -> Scenario:
-    """The scenario of an example, with fewer measurements."""
-    return find_scenario(name, {**changes, "imu_hz": "50", "gnss_hz": "5", "compass_hz": "2"})
+def lighter(name: str, changes: dict[str, str], share: float = 2.0 / 3.0) -> Scenario:
+    """The scenario of an example, with fewer measurements, and so much of its duration."""
+    lasts_s = share * float(changes["duration_s"])
+    return find_scenario(
+        name, {**changes, "duration_s": f"{lasts_s:g}", "imu_hz": "50", "gnss_hz": "2", "compass_hz": "1"}
+    )
 
 
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str, *arguments: object) -> str:
+def run(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    *arguments: object,
+    share: float = 2.0 / 3.0,
+) -> str:
     """Run a script, on what it simulates in half the time; return what it prints."""
     monkeypatch.setattr(simulation, "simulate", simulate_slowly)
-    monkeypatch.setattr(simulation, "find_scenario", lighter)
+    monkeypatch.setattr(simulation, "find_scenario", partial(lighter, share=share))
     monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
     monkeypatch.setattr(sys, "path", [*sys.path])
     runpy.run_path(str(EXAMPLES / name), run_name="__main__")
@@ -61,7 +71,7 @@ def test_smooth_a_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
 
 
 def test_online_loop(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    said = run(monkeypatch, capsys, "online_loop.py")
+    said = run(monkeypatch, capsys, "online_loop.py", share=1.0)
     assert "waiting for" in said
     assert len(re.findall(r"m north, \+- 0\.\d\d m, good", said)) >= 2
     assert "matcher: rejected, judged false" in said

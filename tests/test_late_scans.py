@@ -34,7 +34,7 @@ from graphloc.solution import Cause, Health, Solution
 from graphloc.trajectory import Trajectory
 from tests.bagfactory import START_NS, Messages, S, write_bag
 from tests.faults import arrivals_of, feed
-from tests.slowly import with_few_states
+from tests.slowly import sparsely, with_few_states
 from tests.test_factors import attachment, values_of
 from tests.test_inspect import drive
 from tests.test_inspect_sources import cloud
@@ -46,7 +46,7 @@ SCENARIO = Scenario(path="loops", noise="clean", false_fraction=0.0, gnss_hz=2.0
 @cache
 def late(stamp_sigma_s: float, late_s: float, duration_s: float = 60.0) -> SimulatedRun:
     """A run with matches good to 0.2 m and 0.5 deg, each stamped `late_s` after its scan was taken."""
-    run = simulate(replace(SCENARIO, duration_s=duration_s), 3)
+    run = sparsely(simulate(replace(SCENARIO, duration_s=duration_s), 3), 2)
     late_ns = round(late_s * 1e9)
     moved = [
         replace(m, stamp_ns=m.stamp_ns + late_ns) if isinstance(m, PoseFix) else m for m in run.recording.measurements
@@ -211,7 +211,7 @@ def test_a_clock_that_recording_times_contradict_is_said(
 
 def test_a_delay_that_was_found_goes_on_after_a_restart(tmp_path: Path) -> None:
     """And is given up where the configuration now has it, or none to estimate."""
-    run, path = late(0.05, 0.15, 45.0), tmp_path / "snapshot.json"
+    run, path = late(0.05, 0.15), tmp_path / "snapshot.json"
     came = arrivals_of(run)
     feed(smoother(run, snapshot=path), run, came[: 3 * len(came) // 4])
     (name,) = run.config.of_kind("aerial")

@@ -25,7 +25,7 @@ SHORT = Scenario(duration_s=40.0, noise="drift", imu_hz=50.0, gnss_hz=5.0, compa
 
 @pytest.fixture(scope="module")
 def short() -> app.Run:
-    return beside_filters(simulate_slowly(SHORT, 5))
+    return beside_filters(sparsely(simulate_slowly(SHORT, 5), 2))
 
 
 def test_smoother_beats_the_filter_and_its_covariance_holds(short: app.Run) -> None:
@@ -102,7 +102,7 @@ def test_how_fast_it_turns_is_as_uncertain_as_said(short: app.Run) -> None:
 
 def test_modes_are_chosen() -> None:
     """Three modes a match, one right: the ledger's choice is the right one."""
-    run = simulate_slowly(replace(SHORT, pose_modes=3, false_fraction=0.0, noise="clean"), 2)
+    run = sparsely(simulate_slowly(replace(SHORT, pose_modes=3, false_fraction=0.0, noise="clean"), 2))
     solved = app.simulated(run)
     rows = {row.seq: row for row in solved.solution.ledger}
     chosen = []
@@ -117,7 +117,7 @@ def test_modes_are_chosen() -> None:
 def test_bad_start_is_not_lost() -> None:
     """Gyro bias of 0.05 rad/s and a start heading 15 deg off."""
     scenario = replace(SHORT, noise="clean", gyro_bias_radps=0.05, start_heading_error_deg=15.0)
-    run = simulate_slowly(scenario, 1)
+    run = sparsely(simulate_slowly(scenario, 1))
     ours = compare_to_truth(app.simulated(run).solution.trajectory, run.truth)
     assert ours.heading_max_deg < 1.5
     assert ours.position_rmse_m < 0.5
@@ -150,7 +150,7 @@ def test_rotated_world_gives_the_rotated_estimate() -> None:
 
 @pytest.mark.parametrize("again", [False, True])
 def test_imu_gap_is_bridged_and_said(again: bool) -> None:
-    run = simulate_slowly(replace(SHORT, noise="clean"), 6)
+    run = sparsely(simulate_slowly(replace(SHORT, noise="clean", duration_s=30.0), 6))
     imu = run.recording.imu
     assert imu is not None
     t = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9

@@ -2,6 +2,7 @@
 """The tag detector: on tags drawn here under a known homography, and beside AprilTag 3 on simulated approaches."""
 
 import atexit
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -250,7 +251,7 @@ def test_covariance_is_that_of_the_errors() -> None:
     middle = {}
     for noise, least in ((0.03, 1.5), (0.12, 3.5)):  # without much noise, what is allowed for the lens is too much
         nees, variance = [], []
-        for k in range(60):
+        for k in range(36):
             R = turned(rng.uniform(0, 360), rng.uniform(0, 45), rng.uniform(0, 360))
             image, at = draw(
                 cells_of(k), 90, rng.uniform(20, 45), R, middle=rng.uniform(40, 50, 2), noise=noise, rng=rng,
@@ -260,7 +261,7 @@ def test_covariance_is_that_of_the_errors() -> None:
                 off = (found.corners_px - at).ravel()
                 nees.append(off @ np.linalg.solve(found.cov_px2, off))
                 variance.append(np.trace(found.cov_px2) / 8.0)
-        assert len(nees) > 50
+        assert len(nees) > 30
         assert least < np.mean(nees) < 9.0
         assert np.mean(np.array(nees) < chi2.ppf(0.95, 8)) > 0.9
         middle[noise] = np.median(variance)
@@ -354,10 +355,10 @@ def test_a_view_of_an_image_is_read_like_a_copy() -> None:
 )
 def test_sees_what_april_tag_3_sees_and_more_closely(condition: str, off_px: float) -> None:
     """On simulated approaches, with the corners' true places from a pinhole of our own."""
-    run = simulate(harbour_scenarios()[f"dock-fixed-{condition}"], 3)
+    run = simulate(replace(harbour_scenarios()[f"dock-fixed-{condition}"], imu_hz=10.0), 3)
     camera, K = Camera("camera", scene_of(run), run), run.rig.cameras["camera"].K
     ours_off, theirs_off, nees = [], [], []
-    for k, t in enumerate((46.0, 58.0, 72.0)):
+    for k, t in enumerate((46.0, 72.0)):
         image = camera.take(t, k).pixels
         ours = {d.number: d for d in Detector().detect(image)}
         theirs = by_april_tag_3(image)
@@ -370,7 +371,7 @@ def test_sees_what_april_tag_3_sees_and_more_closely(condition: str, off_px: flo
             nees.append(off @ np.linalg.solve(found.cov_px2, off))
             if number in theirs:
                 theirs_off.append((theirs[number] - flat[:, :2] / flat[:, 2:]).ravel())
-    assert len(ours_off) >= 7
+    assert len(ours_off) >= 5
     rmse = [np.sqrt(np.mean(np.square(off))) for off in (ours_off, theirs_off)]
     assert rmse[0] < min(off_px, 0.6 * rmse[1])
-    assert 2.0 < np.mean(nees) < 14.0  # of 7 to 9: their mean scatters by 1.5
+    assert 2.0 < np.mean(nees) < 14.0  # of 5 or 6: their mean scatters by 1.7

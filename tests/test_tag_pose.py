@@ -44,7 +44,7 @@ def modes(corners_m: Array, rays: Array, cov: Array = COV) -> tuple[TagMode, ...
 def test_the_true_pose_is_among_the_minima() -> None:
     """1 to 30 m, 0 to 75 deg, rolled, off the axis, anywhere in world; the noise-free one to a thousandth of the range."""
     rng = np.random.default_rng(0)
-    for _ in range(300):
+    for _ in range(120):
         corners, p, R = random_view(rng)
         found = [off(pose, p, R) for pose in poses_of(corners, rays_of(corners, p, R), COV)]
         place, turn = min(found, key=lambda each: each[1])
@@ -155,7 +155,7 @@ def brute_minima(corners_m: Array, rays: Array, rng: np.random.Generator) -> lis
 def test_no_minimum_is_missed_and_none_is_made_up() -> None:
     rng = np.random.default_rng(5)
     twofold = 0
-    for k in range(20):
+    for k in range(10):
         corners, p, R = random_view(rng, oblique_deg=None if k % 2 else float(rng.uniform(0.0, 15.0)))
         rays = rays_of(corners, p, R) + rng.normal(0.0, SIGMA, (4, 2))
         ours = [pose.R for pose in poses_of(corners, rays, COV)]
@@ -163,15 +163,15 @@ def test_no_minimum_is_missed_and_none_is_made_up() -> None:
         for one, others in [(R, theirs) for R in ours] + [(R, ours) for R in theirs]:
             assert min(degrees_between(one, other) for other in others) < 2.0
         twofold += len(ours) > 1
-    assert twofold >= 12
+    assert twofold >= 6
 
 
 @cache
 def scattered(range_m: float, oblique_deg: float) -> tuple[Array, Array, Array]:
-    """Of 80 noisy sightings: errors of the mode nearest to the truth and claimed covariances, in camera's axes; NEES."""
+    """Of 40 noisy sightings: errors of the mode nearest to the truth and claimed covariances, in camera's axes; NEES."""
     rng = np.random.default_rng([int(range_m), int(oblique_deg)])
     errors, covs, nees = [], [], []
-    for _ in range(80):
+    for _ in range(40):
         corners, p, R = random_view(rng, range_m=range_m, oblique_deg=oblique_deg, aside=False)
         found = modes(corners, rays_of(corners, p, R) + rng.normal(0.0, SIGMA, (4, 2)))
         mode = found[nearest_mode(found, R)]
@@ -185,7 +185,7 @@ def scattered(range_m: float, oblique_deg: float) -> tuple[Array, Array, Array]:
 @pytest.mark.parametrize("range_m", [2.0, 8.0, 20.0])
 @pytest.mark.parametrize("oblique_deg", [0.0, 10.0, 30.0, 70.0])
 def test_a_modes_covariance_is_what_monte_carlo_shows(range_m: float, oblique_deg: float) -> None:
-    """6 degrees of freedom: the mean of 80 draws is 6 +- 0.4, 1 sigma (sqrt(12 / 80))."""
+    """6 degrees of freedom: the mean of 40 draws is 6 +- 0.55, 1 sigma (sqrt(12 / 40))."""
     errors, covs, nees = scattered(range_m, oblique_deg)
     assert 4.5 < nees.mean() < (7.6 if oblique_deg or range_m < 5.0 else 12.0)
     shown, claimed = np.sqrt((errors**2).mean(axis=0)), np.sqrt(covs.mean(axis=0).diagonal())

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -54,11 +55,19 @@ def surveyed_to(sigma_m: float, sigma_deg: float, seed: int) -> Change:
     return worse
 
 
-@pytest.mark.parametrize("kind", ["fixed", "floating"])
-@pytest.mark.parametrize("share", [1.25, 0.8, 0.393, 1.06])
+@cache
+def all_sized(kind: str, share: float) -> tuple[list[TagSighting], Survey]:
+    """Sightings of tags that are all given as so many times as large, and their survey."""
+    return seen(kind, 1, sized(share * TRUE_M))
+
+
+@pytest.mark.parametrize(
+    ("kind", "share"),
+    [*(("fixed", share) for share in (1.25, 0.8, 0.393, 1.06)), *(("floating", share) for share in (1.25, 0.393))],
+)
 def test_sizes_that_are_all_wrong(kind: str, share: float) -> None:
     """The white margin measured, too (10 cells for 8); a border left out; the size of a well-known example; scaled by a printer."""
-    sightings, survey = seen(kind, 1, sized(share * TRUE_M))
+    sightings, survey = all_sized(kind, share)
     frame = "world" if kind == "fixed" else "north_dock"
     assert size_factors(sightings, survey) == {frame: pytest.approx(1.0 / share, rel=0.02)}
 
@@ -66,7 +75,7 @@ def test_sizes_that_are_all_wrong(kind: str, share: float) -> None:
 @pytest.mark.parametrize(("share", "refused"), [(1.0, None), (1.06, False), (0.94, False), (1.25, True)])
 def test_sizes_that_are_slightly_wrong_are_said_and_used(share: float, refused: bool | None) -> None:
     """A print scaled by some per cent: the run by itself blames places and attitudes of single tags."""
-    sightings, survey = seen("fixed", 1, sized(share * TRUE_M))
+    sightings, survey = all_sized("fixed", share)
     gathered = Gathering(voyage("fixed", 1).recording)
     _take_sized(gathered, "tags", sightings, survey)
     said = [line for line in gathered.said if "sizes in tags.yaml disagree with the spacing" in line]
@@ -85,7 +94,7 @@ def test_two_tags_are_enough() -> None:
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("fixed", 1), ("floating", 2), ("floating", 3), ("fixed", 4)])
-@pytest.mark.parametrize("sigmas", [(0.0, 0.0), (0.02, 1.0), (0.1, 3.0), (0.3, 5.0)])
+@pytest.mark.parametrize("sigmas", [(0.0, 0.0), (0.1, 3.0), (0.3, 5.0)])
 def test_right_surveys_are_never_refused(kind: str, seed: int, sigmas: tuple[float, float]) -> None:
     only = (226, 227, 230, 231) if seed % 2 else ()
     sightings, survey = seen(kind, seed, surveyed_to(*sigmas, seed), only=only, noise_px=0.15 if seed < 3 else 0.8)
