@@ -213,8 +213,9 @@ def test_a_clock_that_is_set_by_whole_seconds_is_put_right(
     """UTC and GPS time, a leap second, a time zone. It was told, and the vessel put where it was 18 s before; after an hour, all was lost."""
     wrong = lambda ns: ns + by_s * S * (ns >= START_NS + set_s * S)
     read_as = {}
-    found, config, _ = look(tmp_path, restamped({"/fix": wrong}), MAKE)
-    for name, (found, config, recording) in (("set", (found, config, read(tmp_path, config))), ("right", as_it_was)):
+    seen, drafted, _ = look(tmp_path, restamped({"/fix": wrong}), MAKE)
+    both = {"set": (seen, drafted, read(tmp_path, drafted)), "right": as_it_was}
+    for name, (found, config, recording) in both.items():
         read_as[name] = config, [(m.stamp_ns, m.seq) for m in recording.measurements]
         for said in (w for w in (*found.warnings, *recording.warnings) if "the clock of" in w):
             assert f"by {abs(by_s)}.00 s at {utc_text(START_NS + set_s * S + WAY_NS['/fix'])}" in said
