@@ -258,9 +258,7 @@ def test_a_vessel_that_lies_still_is_no_surer_of_its_place_after_outages() -> No
     begin_ns = int(run.truth.stamps_ns[0])
 
     def lost(m: Measurement) -> bool:
-        return isinstance(m, GnssPosition) and any(
-            t < (m.stamp_ns - begin_ns) * 1e-9 < t + 5.0 for t in (8, 14, 20)
-        )
+        return isinstance(m, GnssPosition) and any(t < (m.stamp_ns - begin_ns) * 1e-9 < t + 5.0 for t in (8, 14, 20))
 
     heard = replace(run.recording, measurements=tuple(m for m in run.recording.measurements if not lost(m)))
     cut = replace(run, recording=heard)

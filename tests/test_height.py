@@ -23,7 +23,9 @@ UP_M = 4.0  # a slow error of height that lasts longer than the run
 
 
 def raised(sigma_m: float) -> SimulatedRun:
-    run = simulate(Scenario(duration_s=30.0, noise="clean", false_fraction=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3)
+    run = simulate(
+        Scenario(duration_s=30.0, noise="clean", false_fraction=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3
+    )
 
     def up(m: Measurement) -> Measurement:
         if not isinstance(m, GnssPosition):

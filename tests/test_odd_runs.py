@@ -417,7 +417,9 @@ def test_the_deviation_of_a_compass_is_told_by_the_motion() -> None:
 
 def test_a_compass_that_wanders_is_held_by_the_map_and_in_its_bounds() -> None:
     """Off by up to 3 deg, three of its sigmas, now to one side, now to the other, in 40 s. Taken for noise it bends the heading."""
-    scenario = replace(BASE, duration_s=40.0, pose_hz=1.0, gnss_hz=10.0, compass_hz=10.0, imu_hz=100.0, false_fraction=0.2)
+    scenario = replace(
+        BASE, duration_s=40.0, pose_hz=1.0, gnss_hz=10.0, compass_hz=10.0, imu_hz=100.0, false_fraction=0.2
+    )
     run = simulate(scenario, 3)
 
     def wandered(m: Measurement) -> Measurement:

@@ -160,7 +160,11 @@ def test_a_wrong_rtk_fix_is_not_followed(solve: Callable[[Recording, VesselConfi
 @pytest.mark.parametrize("solve", [app.smooth_recording, app.replay_recording], ids=["offline", "online"])
 def test_a_wrong_rtk_fix_ends_where_rtk_does(solve: Callable[[Recording, VesselConfig], app.Run]) -> None:
     """4 m off from 30 to 40 s, then none; from 55 s on it is right again: ambiguities are resolved anew, so it was not 4 m off still."""
-    _, two = receiver(lambda t: not 40.0 < t < 55.0, lambda t: (4.0, 0.0) if 30.0 < t < 40.0 else (0.0, 0.0), replace(TRACK, duration_s=64.0))
+    _, two = receiver(
+        lambda t: not 40.0 < t < 55.0,
+        lambda t: (4.0, 0.0) if 30.0 < t < 40.0 else (0.0, 0.0),
+        replace(TRACK, duration_s=64.0),
+    )
     solution, off_m, t = solved(two, solve)
     back = t > 57.0
     assert off_m[back].max() < 0.2
