@@ -283,10 +283,10 @@ def _repeated(arrivals: Arrivals, at_ns: int, rng: np.random.Generator) -> tuple
     return found, until_ns
 
 
-def _flood(arrivals: Arrivals, at_ns: int, rng: np.random.Generator) -> tuple[Arrivals, int]:
-    """A message that is no IMU's comes 3000 times."""
+def flood(arrivals: Arrivals, at_ns: int, rng: np.random.Generator, times: int = 3000) -> tuple[Arrivals, int]:
+    """A message that is no IMU's comes very often."""
     n = next((n for n, a in enumerate(arrivals) if a.true_ns >= at_ns and not isinstance(a.m, ImuSample)), 0)
-    return [*arrivals[:n], *[arrivals[n]] * 3000, *arrivals[n:]], at_ns
+    return [*arrivals[:n], *[arrivals[n]] * times, *arrivals[n:]], at_ns
 
 
 def _strangers(arrivals: Arrivals, at_ns: int, rng: np.random.Generator) -> tuple[Arrivals, int]:
@@ -327,5 +327,5 @@ FAULTS: dict[str, Fault] = {
     "wrong headings": _for(CompassHeading, 1.0, 8.0, _turned),
     "false poses": _for(PoseFix, 2.0, 8.0, _false),
     "strangers": _strangers,
-    "flood": _flood,
+    "flood": flood,
 }

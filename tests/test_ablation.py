@@ -36,7 +36,7 @@ from tests.slowly import simulate_slowly
 OFF_DEG = 12.0
 
 
-def made(rate_hz: float = 2.5, **changes: object) -> SimulatedRun:
+def made(rate_hz: float = 1.25, **changes: object) -> SimulatedRun:
     base = Scenario(duration_s=18.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, noise="clean", false_fraction=0.2)
     return simulate_slowly(replace(base, **changes), 4, rate_hz)  # type: ignore[arg-type]
 
@@ -44,7 +44,7 @@ def made(rate_hz: float = 2.5, **changes: object) -> SimulatedRun:
 @pytest.fixture(scope="module")
 def solved() -> tuple[SimulatedRun, Ablated, Solution]:
     """A compass that is 12 deg off, and no truth to tell; what came of it, and of the run with all of its sensors."""
-    run, smooth, every = made(compass_offset_deg=OFF_DEG, path="loops", duration_s=24.0), app.smooth_recording, []
+    run, smooth, every = made(2.5, compass_offset_deg=OFF_DEG, path="loops", duration_s=24.0), app.smooth_recording, []
 
     def kept(*arguments: Any, **options: Any) -> app.Run:
         every.append(smooth(*arguments, **options))
@@ -116,7 +116,7 @@ def test_each_sensor_is_left_out_but_the_imu(bad: tuple[SimulatedRun, Ablated]) 
 
 
 def test_against_truth_the_numbers_are_those_of_a_run_without_it() -> None:
-    run = made(1.25, compass_hz=0.0, duration_s=12.0)
+    run = made(compass_hz=0.0, duration_s=12.0)
     found = ablate(run.recording, run.config)
     assert found.basis == "truth"
     gone = run.config.sensors["matcher"].model_copy(update={"enabled": False})

@@ -116,7 +116,7 @@ def yaw_errors_deg(run: SimulatedRun, fed: Fed) -> Array:
 
 @pytest.mark.parametrize("mode", [offline, online])
 def test_a_displaced_antenna_is_found_out(mode: Callable[[SimulatedRun], TruthMetrics]) -> None:
-    believed, estimated = mode(displaced(0.0)), mode(displaced(1.0))
+    believed, estimated = offline(displaced(0.0)), mode(displaced(1.0))
     assert believed.coverage_95 is not None
     assert estimated.nees is not None
     assert believed.coverage_95 < 0.1
@@ -147,11 +147,16 @@ def test_it_is_told_in_axes_of_the_body() -> None:
     assert set(PLACE) < set(told)
 
 
+@cache
+def with_gaps() -> app.Run:
+    run = displaced(1.0)
+    return app.smooth_recording(run.recording, run.config, hold_out=HoldOut(gaps=4, gap_s=3.0))
+
+
 @pytest.mark.parametrize("filtered", [False, True])
 def test_held_out_fixes_are_predicted_at_the_antenna_as_each_estimate_has_it(filtered: bool) -> None:
     """A filter that believes the configured place predicts them there."""
-    run = displaced(1.0)
-    found = app.smooth_recording(run.recording, run.config, hold_out=HoldOut(gaps=4, gap_s=3.0))
+    found = with_gaps()
     antennas, name = app.antennas(found), "an EKF" if filtered else found.solution.name
     off = compare_to_held_out(found.solution.trajectory, found.held, found.solution.datum, antennas.of(name))
     assert (off.horizontal_rmse_m < 0.1) is not filtered
@@ -236,11 +241,11 @@ def test_the_report_says_that_bounds_hang_on_the_guess_of_an_antenna(*, still: b
 
 def test_a_vessel_that_lies_still_is_no_surer_of_its_place_after_restarts(tmp_path: Path) -> None:
     """Where nothing new is told, position and antenna are known together only; apart, each restart would tell them again."""
-    lying = replace(SCENARIO, path="still", duration_s=30.0, wave_roll_deg=0.2, wave_pitch_deg=0.2, wave_heave_m=0.02)
+    lying = replace(SCENARIO, path="still", duration_s=24.0, wave_roll_deg=0.2, wave_pitch_deg=0.2, wave_heave_m=0.02)
     run = displaced(1.0, scenario=lying)
     came, path = arrivals_of(run), tmp_path / "snapshot.json"
     whole = feed(smoother(run), run, came).estimates[-1]
-    for part in np.array_split(np.arange(len(came)), 5):
+    for part in np.array_split(np.arange(len(came)), 4):
         fed = feed(smoother(run, snapshot=path), run, came[part[0] : part[-1] + 1])
     assert any(event.startswith("resumed from a snapshot") for event in fed.events)
     assert fed.estimates[-1].bound_95_m > 0.8 * whole.bound_95_m
@@ -248,14 +253,12 @@ def test_a_vessel_that_lies_still_is_no_surer_of_its_place_after_restarts(tmp_pa
 
 def test_a_vessel_that_lies_still_is_no_surer_of_its_place_after_outages() -> None:
     """The antenna's place left the window in each, and was told again after it: fewer fixes made the bound smaller."""
-    lying = replace(SCENARIO, path="still", duration_s=40.0, wave_roll_deg=0.2, wave_pitch_deg=0.2, wave_heave_m=0.02)
+    lying = replace(SCENARIO, path="still", duration_s=27.0, wave_roll_deg=0.2, wave_pitch_deg=0.2, wave_heave_m=0.02)
     run = displaced(1.0, scenario=lying)
     begin_ns = int(run.truth.stamps_ns[0])
 
     def lost(m: Measurement) -> bool:
-        return isinstance(m, GnssPosition) and any(
-            t < (m.stamp_ns - begin_ns) * 1e-9 < t + 5.0 for t in (10, 17, 24, 31)
-        )
+        return isinstance(m, GnssPosition) and any(t < (m.stamp_ns - begin_ns) * 1e-9 < t + 5.0 for t in (8, 14, 20))
 
     heard = replace(run.recording, measurements=tuple(m for m in run.recording.measurements if not lost(m)))
     cut = replace(run, recording=heard)

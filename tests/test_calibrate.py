@@ -14,7 +14,7 @@ from graphloc.config import BodyVelocityConfig, ImuConfig, VelocityConfig, Vesse
 from graphloc.eval.calibrate import PROBE, Calibration, Check, Suggestion, _check, _suggestion
 from graphloc.eval.calibrate._evidence import Evidence, OffsetEstimate
 from graphloc.eval.calibrate._imu import imu_noise
-from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frontends.time_offsets import heading_time_offset
 from graphloc.frontends.turning import Turning
@@ -132,7 +132,6 @@ def simulated() -> SimulatedRun:
             compass_hz=5.0,
         ),
         5,
-        5.0,
     )
     true = {"accel_noise_ug_per_sqrt_hz": 300.0, "gyro_noise_mdps_per_sqrt_hz": 8.0}  # the scenario's
     config = changed(run.config, "imu", **true)
@@ -250,7 +249,7 @@ def test_imu_noise_that_is_configured_too_large_is_seen(times: float, needed: fl
 
 
 def test_nothing_is_looked_at_unasked(right: app.Run) -> None:
-    short = simulate(Scenario(duration_s=12.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 1)
+    short = simulate_slowly(Scenario(duration_s=12.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 1)
     datum = app.choose_datum(short.recording, short.config)
     recording = app.with_synthetic(short.recording, short.config, datum)
     plain = smooth(recording, short.config, datum, rows=SENSORS, inertial=INERTIAL)
@@ -266,7 +265,7 @@ def test_a_solution_stands_where_nothing_can_be_said_of_it(monkeypatch: pytest.M
         raise RuntimeError("Factor is exactly singular")
 
     monkeypatch.setattr("graphloc.solve.offsets_of", fail)
-    run = app.simulated(simulate(Scenario(duration_s=12.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 1))
+    run = app.simulated(simulate_slowly(Scenario(duration_s=12.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 1))
     assert any(
         "calibration could not be examined: Factor is exactly singular" in w for w in run.solution.stats.warnings
     )

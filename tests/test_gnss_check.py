@@ -27,7 +27,7 @@ def run() -> SimulatedRun:
     scenario = Scenario(
         path="loops", duration_s=60.0, noise="clean", false_fraction=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0
     )
-    return sparsely(simulate_slowly(scenario, 21, rate_hz=2.5), 2)
+    return sparsely(simulate_slowly(scenario, 21, rate_hz=1.25), 2)
 
 
 def said(

@@ -23,7 +23,9 @@ UP_M = 4.0  # a slow error of height that lasts longer than the run
 
 
 def raised(sigma_m: float) -> SimulatedRun:
-    run = simulate(Scenario(duration_s=30.0, noise="clean", imu_hz=50.0, gnss_hz=2.0), 3)
+    run = simulate(
+        Scenario(duration_s=30.0, noise="clean", false_fraction=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3
+    )
 
     def up(m: Measurement) -> Measurement:
         if not isinstance(m, GnssPosition):
@@ -31,7 +33,7 @@ def raised(sigma_m: float) -> SimulatedRun:
         return replace(m, position=m.position._replace(height_m=m.position.height_m + UP_M))
 
     height = HeightConfig(median_sigma_m=sigma_m)
-    config = with_few_states(run.config.with_sensors({"height": height}), 2.5)
+    config = with_few_states(run.config.with_sensors({"height": height}), 1.25)
     return replace(run, recording=run.recording.changed(up), config=config)
 
 

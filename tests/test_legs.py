@@ -142,7 +142,7 @@ def test_a_leg_without_a_place_is_no_reason_to_fail() -> None:
     run = simulate(replace(LOOPS, duration_s=60.0), 3)
     first = begin_ns(run)
     early = tuple(m for m in run.recording.measurements if isinstance(m, CompassHeading) or m.stamp_ns < first + 20 * S)
-    found = solved(run, 30.0, early)
+    found = solved(run, 30.0, early, rate_hz=0.625)
     (said,) = found.stats.events
     assert "solved in one piece, not in legs: a leg failed" in said
     assert "no position" in said
@@ -152,7 +152,7 @@ def test_a_leg_without_a_place_is_no_reason_to_fail() -> None:
 def test_a_sensor_that_fell_silent_was_heard_in_the_leg_before(run: SimulatedRun) -> None:
     first = begin_ns(run)
     quiet = tuple(m for m in run.recording.measurements if not isinstance(m, PoseFix) or m.stamp_ns < first + 30 * S)
-    found = solved(run, measurements=quiet)
+    found = solved(run, measurements=quiet, rate_hz=0.625)
     name = next(m.sensor for m in run.recording.of(PoseFix))
     seconds = (found.trajectory.stamps_ns - first) * 1e-9
     since = found.since_agreed_s[name][seconds > 35.0]
@@ -196,7 +196,7 @@ def test_turning_where_legs_meet_is_no_jump(legs: Solution) -> None:
 def test_a_figure_that_each_leg_finds_anew_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an IMU configured with a tenth of its noise: the line of the leg that needs most, not one of each leg."""
     noisy: dict[str, Any] = {"accel_noise_ug_per_sqrt_hz": 2000.0, "gyro_noise_mdps_per_sqrt_hz": 40.0}
-    run = simulate(replace(LOOPS, duration_s=60.0, pose_hz=4.0, pose_sigma_m=0.05, false_fraction=0.0, **noisy), 1)
+    run = simulate(replace(LOOPS, duration_s=60.0, pose_hz=2.0, pose_sigma_m=0.05, false_fraction=0.0, **noisy), 1)
     make, lines = graphloc.solve.make_solution, list[str]()
 
     def noted(*args: Any) -> Solution:

@@ -113,7 +113,7 @@ def test_a_vessel_that_stops_is_believed_and_does_not_begin_to_slide() -> None:
 def lost() -> Lost:
     """The last 90 s have compass and IMU alone. For six of them the IMU is silent, too: along which axes it moved there nobody knows."""
     run = simulate(
-        replace(Scenario(path="loops", noise="drift"), duration_s=115.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3
+        replace(Scenario(path="loops", noise="drift"), duration_s=115.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=1.0), 3
     )
     lost_ns = int(run.truth.stamps_ns[0]) + 25 * SECOND
     kept = tuple(m for m in run.recording.measurements if isinstance(m, CompassHeading) or m.stamp_ns < lost_ns)

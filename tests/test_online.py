@@ -25,7 +25,7 @@ from graphloc.signals.thinning import THINNED
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 from tests.faults import Arrival, Arrivals, Fed, arrivals_of, complaints, copied, delayed, feed, finish
-from tests.slowly import slowly
+from tests.slowly import slowly, sparsely
 from tests.tagfactory import sighted
 
 RATE_HZ = 2.5  # of states
@@ -37,9 +37,15 @@ def smoother(run: SimulatedRun, *, lag_s: float = 10.0) -> OnlineSmoother:
 
 @cache
 def drift() -> SimulatedRun:
-    """Sensors at half the rates of BL or less, states at a quarter: a fifth of the time."""
+    """21 s; sensors at half the rates of BL or less, states at a quarter: a fifth of the time."""
     scenario = replace(bl_scenario(1, "drift"), duration_s=30.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=2.0)
-    return slowly(simulate(scenario, 0), RATE_HZ)
+    run = slowly(simulate(scenario, 0), RATE_HZ)
+    end_ns, imu = run.truth.stamps_ns[0] + 21_000_000_000, run.recording.imu
+    assert imu is not None
+    measurements = tuple(m for m in run.recording.measurements if m.stamp_ns < end_ns)
+    return replace(
+        run, recording=replace(run.recording, imu=imu.where(imu.stamps_ns < end_ns), measurements=measurements)
+    )
 
 
 def whole(run: SimulatedRun, arrivals: Arrivals, *, lag_s: float = 10.0) -> tuple[Fed, Trajectory]:
@@ -112,7 +118,7 @@ def test_false_matches_are_rejected_with_a_reason() -> None:
             else:
                 right += row.outcome is Outcome.USED
     assert wrong == 0
-    assert right >= 15
+    assert right >= 10  # of 13
 
 
 def test_a_right_match_that_comes_alone_refutes_false_ones_that_agree() -> None:
@@ -121,8 +127,8 @@ def test_a_right_match_that_comes_alone_refutes_false_ones_that_agree() -> None:
     The next right one agrees with those before them; alone, it was no other choice, and was judged false.
     """
     scenario = replace(Scenario(path="loops", noise="drift"), duration_s=132.0, outage_s=(60.0, 120.0))
-    run = slowly(simulate(scenario, 19))
-    begin_ns = run.truth.stamps_ns[0] + 40_000_000_000  # 20 s of fixes are enough to drift from
+    run = sparsely(slowly(simulate(scenario, 19), 1.25))
+    begin_ns = run.truth.stamps_ns[0] + 50_000_000_000  # 10 s of fixes are enough to drift from
     fed = feed(smoother(run), run, without(arrivals_of(run), lambda a: a.true_ns < begin_ns))
     t_s, off = (np.array(fed.true_ns) - run.truth.stamps_ns[0]) * 1e-9, np.array(fed.errors_m)
     assert off[(t_s > 130.0) & (t_s < 131.4)].min() > 1.0  # else this shows nothing
@@ -196,7 +202,6 @@ def test_everything_late_from_the_first_message_on() -> None:
     assert complaints(arrivals, fed) == []
     assert all(row.outcome is Outcome.USED for row in fed.rows if row.sensor == "imu")
     apart = apart_m(lag, in_order()[1])
-    assert apart[:-15].max() < 0.01
     assert apart.max() < 0.01
 
 
@@ -226,8 +231,8 @@ def test_a_prediction_knows_imu_samples_that_came_late() -> None:
 def test_an_imu_step_is_reintegrated_when_its_samples_come_late() -> None:
     """One hole, filled 1.5 s later: the end is that of the run without it."""
     arrivals = arrivals_of(drift())
-    begin = arrivals[0].true_ns + 20_000_000_000
-    hole = [a for a in arrivals if isinstance(a.m, ImuSample) and begin <= a.true_ns < begin + 300_000_000]
+    begin = arrivals[0].true_ns + 15_000_000_000
+    hole = [a for a in arrivals if isinstance(a.m, ImuSample) and begin <= a.true_ns < begin + 500_000_000]
     rest = [a for a in arrivals if a not in hole]
     after = next(n for n, a in enumerate(rest) if a.true_ns > begin + 1_800_000_000)
     online = smoother(drift())
@@ -275,9 +280,9 @@ def test_the_way_to_a_measurement_is_reintegrated_when_samples_come_late() -> No
 def test_later_than_the_lag_is_late() -> None:
     arrivals = arrivals_of(drift())
     fixes = [a for a in arrivals if isinstance(a.m, GnssPosition)]
-    old = [a for a in fixes if a.true_ns < arrivals[0].true_ns + 8_000_000_000][-10:]
+    old = [a for a in fixes if a.true_ns < arrivals[0].true_ns + 7_000_000_000][-10:]
     rest = [a for a in arrivals if a not in old]
-    after = next(n for n, a in enumerate(rest) if a.true_ns > arrivals[0].true_ns + 25_000_000_000)
+    after = next(n for n, a in enumerate(rest) if a.true_ns > arrivals[0].true_ns + 18_000_000_000)
     shuffled = [*rest[:after], *old, *rest[after:]]
     fed, _ = whole(drift(), shuffled)
     assert complaints(shuffled, fed) == []
@@ -301,7 +306,7 @@ def said_while_waiting(run: SimulatedRun, arrivals: Arrivals) -> tuple[list[str]
 
 def test_starts_from_fix_and_compass() -> None:
     arrivals = without(arrivals_of(drift()), lambda a: isinstance(a.m, PoseFix))
-    said, fed = said_while_waiting(drift(), arrivals[: len(arrivals) // 2])
+    said, fed = said_while_waiting(drift(), arrivals[: len(arrivals) // 3])
     assert said[0] != ""
     assert said[-1] == ""
     assert any("s of IMU data" in s for s in said)
@@ -370,7 +375,7 @@ def test_a_start_that_waited_longer_than_the_lag_keeps_what_it_found() -> None:
 def test_a_start_that_waited_uses_what_came_just_before_its_first_state() -> None:
     """Fixes 60 ms before the states that they are tied to: of the one tied to the first state of the lag, too, the start has made use."""
     run = slowly(
-        simulate(replace(Scenario(path="loops", noise="clean"), duration_s=24.0, gnss_hz=2.0, imu_hz=50.0), 1), RATE_HZ
+        simulate(replace(Scenario(path="loops", noise="clean"), duration_s=18.0, gnss_hz=2.0, imu_hz=50.0), 1), RATE_HZ
     )
     arrivals = [
         replace(a, m=replace(a.m, stamp_ns=a.m.stamp_ns - 60_000_000)) if isinstance(a.m, GnssPosition) else a
@@ -405,7 +410,7 @@ def test_what_closes_a_slow_chain_counts_once_after_a_start_that_waited() -> Non
 @pytest.mark.usefixtures("few_tries")
 def test_a_start_whose_heading_is_a_guess_is_no_surer_of_its_place_than_the_receiver() -> None:
     """Fixes whose slow error is 2 m and no compass: a heading that goes on turning in the lag tells no place."""
-    run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=35.0, gnss_hz=2.0, imu_hz=50.0), 1)
+    run = simulate(replace(Scenario(path="loops", noise="clean"), duration_s=25.0, gnss_hz=2.0, imu_hz=50.0), 1)
     run = slowly(replace(run, config=run.config.model_copy(update={"sensors": receiver_alone(run)})))
     fed = feed(
         online := smoother(run, lag_s=5.0),
@@ -448,7 +453,7 @@ def test_starts_from_given_poses() -> None:
 
 
 def test_starts_from_a_tag_alone() -> None:
-    scenario = replace(harbour_scenarios()["dock-fixed-optimal"], duration_s=120.0, gnss_hz=0.0, compass_hz=0.0)
+    scenario = replace(harbour_scenarios()["dock-fixed-optimal"], duration_s=42.0, gnss_hz=0.0, compass_hz=0.0)
     run, _ = sighted(slowly(simulate(replace(scenario, imu_hz=50.0), 0)), rate_hz=2.0)
     arrivals = arrivals_of(run)
     first = next(n for n, a in enumerate(arrivals) if a.m.sensor == "tags")
@@ -490,8 +495,8 @@ def test_a_second_imu_is_left_aside() -> None:
 
 
 def test_odom_does_not_jump_where_the_map_does() -> None:
-    """Fixes come back after 60 s of dead reckoning: the map jumps by metres, odometry goes on as the vessel does."""
-    scenario = replace(bl_scenario(1, "drift"), duration_s=90.0, outage_s=(12.0, 72.0), gyro_bias_radps=0.01)
+    """Fixes come back after 34 s of dead reckoning: the map jumps by metres, odometry goes on as the vessel does."""
+    scenario = replace(bl_scenario(1, "drift"), duration_s=54.0, outage_s=(10.0, 44.0), gyro_bias_radps=0.01)
     run = slowly(simulate(replace(scenario, imu_hz=50.0, gnss_hz=5.0, compass_hz=2.0), 2), 1.25)
     fed, _ = whole(run, arrivals_of(run))
     e = fed.estimates
@@ -541,13 +546,13 @@ def sizes(online: OnlineSmoother) -> dict[str, int]:
 def test_memory_does_not_grow() -> None:
     """Sensors at low rates and a short lag, so that a minute holds many lags: nothing is larger at its end than before."""
     scenario = replace(bl_scenario(2, "drift"), duration_s=50.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0)
-    run = simulate(scenario, 1)
+    run = slowly(simulate(scenario, 1), RATE_HZ)
     online, arrivals = smoother(run, lag_s=3.0), arrivals_of(run)
     early: dict[str, int] = {}
     late: dict[str, int] = {}
     for n, a in enumerate(arrivals):
         feed(online, run, [a])
-        if n % 60 == 0:
+        if n % 120 == 0:
             t = (a.true_ns - arrivals[0].true_ns) * 1e-9
             if 14.0 < t < 28.0 or t > 36.0:
                 largest = early if t < 30.0 else late
@@ -561,8 +566,8 @@ def test_memory_does_not_grow() -> None:
     remembered |= set(agreed)
     # 40 s: at most six pairs in five seconds
     assert max(size for name, size in late.items() if ".sensor_noise._pairs" in name) <= 54
-    # 40 s: at the 10 Hz of states, at the 2 Hz of fixes
-    assert late["online._persistent.heading_check._steps"] <= 401
+    # 40 s: at the 2.5 Hz of states, at the 2 Hz of fixes
+    assert late["online._persistent.heading_check._steps"] <= 101
     assert late["online._persistent.heading_check._fixes"] <= 83
     grown = {n: (early.get(n, 0), s) for n, s in late.items() if n not in remembered and s > 1.15 * early.get(n, 0) + 5}
     assert len(early) > 30
@@ -571,7 +576,7 @@ def test_memory_does_not_grow() -> None:
 
 def test_headings_and_fixes_faster_than_they_err_anew_are_thinned() -> None:
     """At 50 Hz: as if every third had come alone, with a row for each of the others."""
-    scenario = replace(bl_scenario(1, "drift"), duration_s=13.0, imu_hz=50.0, gnss_hz=50.0, compass_hz=50.0)
+    scenario = replace(bl_scenario(1, "drift"), duration_s=7.5, imu_hz=50.0, gnss_hz=50.0, compass_hz=50.0)
     run = slowly(simulate(scenario, 0), RATE_HZ)
     fast = {kind: run.recording.of(kind) for kind in (CompassHeading, GnssPosition)}
     many = {m.seq for said in fast.values() for n, m in enumerate(said) if n % 3}

@@ -2,6 +2,7 @@
 """Fixes far off for seconds are outliers, not the IMU's noise."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -45,9 +46,9 @@ _FINE_FIXES = Scenario(gnss_sigma_m=0.05, gnss_reported_sigma_m=0.21, imu_hz=50.
 
 
 def test_bursts_of_far_fixes_leave_the_imu_its_noise() -> None:
-    """Three seconds of twenty, 30 m to the north, of 10 Hz fixes good to 0.5 m."""
+    """Three seconds of twenty, twice, 30 m to the north, of 10 Hz fixes good to 0.5 m."""
     scenario = Scenario(
-        path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, imu_hz=50.0, compass_hz=1.0, gnss_sigma_m=0.5,
+        path="loops", duration_s=42.0, noise="clean", pose_hz=0.0, imu_hz=50.0, compass_hz=1.0, gnss_sigma_m=0.5,
         gnss_reported_sigma_m=0.5,
     )  # fmt: skip
     run = simulate_slowly(scenario, 901, 1.25)
@@ -117,7 +118,7 @@ def test_a_compass_that_is_off_for_half_of_the_run_is_not_a_wide_one(monkeypatch
 def test_gentle_losses_are_tried_where_a_sensor_disagrees_not_where_dead_reckoning_was_far_off(
     monkeypatch: pytest.MonkeyPatch, off_deg: float
 ) -> None:
-    run = simulate_slowly(replace(_FINE_FIXES, path="loops", duration_s=40.0, gnss_hz=2.0, compass_hz=2.0), 1)
+    run = simulate_slowly(replace(_FINE_FIXES, path="loops", duration_s=40.0, gnss_hz=2.0, compass_hz=2.0), 1, 1.25)
     stages, moved_m = list[Stage](), list[float]()
 
     def weighed(*args: Any, stage: Stage, **options: Any) -> Any:
@@ -409,10 +410,10 @@ def test_a_jump_is_detected_online_and_reported_once() -> None:
     assert not watch.doubtful(300_000_000_000)
 
 
-def believed(off_m: float, last_s: float) -> tuple[Recording, Recording, VesselConfig]:
+def believed(off_m: float, last_s: float, duration_s: float = 45.0) -> tuple[Recording, Recording, VesselConfig]:
     """A run whose place one receiver tells, good to 1 cm, and the same where it is off from 20 s on."""
     scenario = Scenario(
-        path="loops", duration_s=45.0, pose_hz=0.0, compass_hz=1.0, gnss_hz=5.0, gnss_sigma_m=0.01, gnss_reported_sigma_m=0.02,
+        path="loops", duration_s=duration_s, pose_hz=0.0, compass_hz=1.0, gnss_hz=5.0, gnss_sigma_m=0.01, gnss_reported_sigma_m=0.02,
         imu_hz=50.0,
     )  # fmt: skip
     run = simulate(scenario, 1)
@@ -432,7 +433,7 @@ def believed(off_m: float, last_s: float) -> tuple[Recording, Recording, VesselC
 
 def test_a_run_with_a_jump_that_the_bounds_do_not_cover_is_not_good() -> None:
     """Its bound was 2 cm, and its health good, where it was 0.6 m off."""
-    right, wrong, config = believed(0.6, last_s=35.0)
+    right, wrong, config = believed(0.6, last_s=26.0, duration_s=30.0)
     usual, jumped = (app.smooth_recording(of, config).solution for of in (right, wrong))
     assert not any("position jump" in line for line in usual.stats.warnings)
     assert "position jump of gnss, and no other sensor measures position" not in map(str, usual.health_reason)
@@ -445,11 +446,10 @@ def test_a_run_with_a_jump_that_the_bounds_do_not_cover_is_not_good() -> None:
     assert live.solution.health[-1] != Health.GOOD == usual_live.solution.health[-1]
 
 
-@pytest.mark.parametrize(("off_m", "rate_hz"), [(300.0, 2.5), (100.0, 2.5)])
-def test_a_jump_is_remembered_through_a_restart_online(off_m: float, rate_hz: float) -> None:
+def test_a_jump_is_remembered_through_a_restart_online() -> None:
     """Off by 150 m it is rejected for 15 s; then it was called good where it was 150 m off."""
-    _, wrong, config = believed(off_m, last_s=np.inf)
-    live = replay(wrong, with_few_states(config, rate_hz)).solution
+    _, wrong, config = believed(150.0, last_s=np.inf)
+    live = replay(wrong, with_few_states(config)).solution
     assert any("restarts" in line for line in live.stats.warnings)
     late = live.trajectory.stamps_ns > live.trajectory.stamps_ns[0] + 20_000_000_000
     assert late[-1]
@@ -459,7 +459,7 @@ def test_a_jump_is_remembered_through_a_restart_online(off_m: float, rate_hz: fl
 
 def test_a_jump_of_the_only_receiver_is_reported_in_the_run() -> None:
     run = simulate_slowly(
-        Scenario(path="loops", duration_s=30.0, noise="drift", pose_hz=0.0, imu_hz=50.0, compass_hz=1.0, gnss_hz=5.0),
+        Scenario(path="loops", duration_s=24.0, noise="drift", pose_hz=0.0, imu_hz=50.0, compass_hz=1.0, gnss_hz=2.5),
         1,
         1.25,
     )
@@ -541,11 +541,17 @@ def test_of_fixes_seconds_apart_two_on_each_side_show_a_jump() -> None:
     assert at_ns.tolist() == [120_000_000_000]
 
 
+@cache
 def lone_problem(slow: SlowErrorConfig | None = None) -> Problem:
     """A short run of one receiver, IMU and compass, ready to be solved."""
     _, recording, config = jumping_alone(5.0, (0.0, 0.0), 12.0, slow=slow, rate_hz=2.5)
     datum = app.choose_datum(recording, config)
     return make_problem(app.with_synthetic(recording, config, datum), config, datum, SENSORS, INERTIAL)
+
+
+@cache
+def lone_solution() -> batch.BatchResult:
+    return batch.solve_batch(lone_problem())
 
 
 def receiver_of(problem: Problem) -> Stream:
@@ -584,7 +590,7 @@ def test_a_run_whose_slow_error_is_off_is_not_solved_again_for_jumps() -> None:
 
 def test_a_run_that_cannot_be_solved_with_its_jumps_is_solved_without(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = lone_problem()
-    right = batch.solve_batch(problem)
+    right = lone_solution()
     jumped = with_jumps_off_track(problem, off_at(problem, 4.1))
     assert jumped is not None
 
@@ -607,7 +613,7 @@ def test_a_run_that_cannot_be_solved_with_other_noise_is_solved_as_it_was(
 ) -> None:
     """With that of the sensors, the run failed."""
     problem, tries = lone_problem(), list[int]()
-    right = batch.solve_batch(problem)
+    right = lone_solution()
 
     def once(*args: Any, **options: Any) -> Any:
         tries.append(1)
@@ -631,7 +637,7 @@ def test_a_run_that_cannot_be_solved_with_other_noise_is_solved_as_it_was(
 def test_jumps_that_do_not_make_the_run_clearly_more_probable_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a receiver whose fixes wandered by metres within seconds seven were: 15 m off, and 3 m without them."""
     problem = lone_problem()
-    right = batch.solve_batch(problem)
+    right = lone_solution()
     jumped = with_jumps_off_track(problem, off_at(problem, 4.1, 8.1))
     monkeypatch.setattr(batch, "with_jumps_off_track", lambda *_: jumped)
     found = batch.solve_batch(problem)
@@ -691,7 +697,7 @@ def test_a_run_that_begins_in_a_jump_of_the_only_receiver_is_led_back(off_m: flo
 @pytest.mark.parametrize("off_s", [(55.0, 65.0), (5.0, 15.0)])
 def test_a_receiver_may_be_at_another_level_after_an_outage(off_s: tuple[float, float]) -> None:
     """Silent for 40 s, 15 m off for the 10 s before or after: the track had bent there, and right fixes were taken for an error."""
-    run, recording, config = jumping_alone(2.0, off_s, 100.0, off_m=15.0)
+    run, recording, config = jumping_alone(1.0, off_s, 100.0, off_m=15.0)
     begin_ns, imu = int(run.truth.stamps_ns[0]), recording.imu
     assert imu is not None
     kept = [
@@ -713,8 +719,8 @@ def test_a_receiver_may_be_at_another_level_after_an_outage(off_s: tuple[float, 
 
 @pytest.mark.parametrize("gnss_hz", [1.0, 5.0])
 def test_a_jump_of_the_only_receiver_is_not_followed_online(gnss_hz: float) -> None:
-    """12 m for 12 s, and back. It was followed within seconds, past the fixes, with the heading turned."""
-    run, recording, config = jumping_alone(gnss_hz, (20.0, 32.0), 42.0)
+    """12 m for 10 s, and back. It was followed within seconds, past the fixes, with the heading turned."""
+    run, recording, config = jumping_alone(gnss_hz, (12.0, 22.0), 28.0)
     live = replay(recording, with_few_states(config, gnss_hz)).solution
     off = compare_to_truth(live.trajectory, run.truth)
     assert off.coverage_95 is not None
@@ -722,7 +728,7 @@ def test_a_jump_of_the_only_receiver_is_not_followed_online(gnss_hz: float) -> N
     assert off.position_max_m < 2.0
     assert any("gnss: position jump of 1" in w and "treated as its error" in w for w in live.stats.warnings)
     assert sum("the window was rebuilt" in w for w in live.stats.warnings) == 2
-    far_off = live.trajectory.stamps_ns > run.truth.stamps_ns[0] + 25_000_000_000
+    far_off = live.trajectory.stamps_ns > run.truth.stamps_ns[0] + 17_000_000_000
     assert Health.GOOD not in [h for h, k in zip(live.health, far_off, strict=True) if k]
 
 
@@ -781,7 +787,7 @@ def test_a_start_that_makes_the_imu_far_noisier_than_configured_waits(monkeypatc
 
 def test_where_a_jump_of_the_only_receiver_may_be_its_end_the_bounds_hold_both_levels() -> None:
     """Off by 12 m for the first 8 s: the level before the jump is the wrong one, and held until a restart."""
-    run, recording, config = jumping_alone(5.0, (0.0, 8.0), 78.0)
+    run, recording, config = jumping_alone(2.5, (0.0, 8.0), 78.0)
     track = replay(recording, config).solution.trajectory
     after = track.where(track.stamps_ns > run.truth.stamps_ns[0] + 11_000_000_000)
     off = compare_to_truth(after, run.truth)
@@ -812,7 +818,7 @@ def test_a_snapshot_knows_the_jump_of_the_only_receiver(tmp_path: Path) -> None:
 def test_a_wrong_fix_of_rtk_is_not_followed(off_m: float) -> None:
     """As `inspect` drafts RTK. With its slow error switched off, the track followed, and did not converge at 100 m."""
     slow = SlowErrorConfig(horizontal_sigma_m=0.03, vertical_sigma_m=0.06)
-    run, recording, config = jumping_alone(5.0, (15.0, 24.0), 32.0, off_m=off_m, sigma_m=0.01, slow=slow)
+    run, recording, config = jumping_alone(5.0, (12.0, 21.0), 27.0, off_m=off_m, sigma_m=0.01, slow=slow)
     for found, furthest_m in (
         (app.smooth_recording(recording, config).solution, 0.1),
         (replay(recording, with_few_states(config)).solution, 3.0),  # until the jump is detected, a second later
@@ -826,9 +832,9 @@ def test_a_wrong_fix_of_rtk_is_not_followed(off_m: float) -> None:
 
 
 def test_a_wrong_fix_of_rtk_is_not_followed_beside_its_velocity() -> None:
-    """2 m for 15 s, velocities of 0.3 m/s (as where none is stated): online all bent to the fixes, in 3 s, and was good within 0.3 m."""
+    """2 m for 13 s, velocities of 0.3 m/s (as where none is stated): online all bent to the fixes, in 3 s, and was good within 0.3 m."""
     slow = SlowErrorConfig(horizontal_sigma_m=0.03, vertical_sigma_m=0.06)
-    run, recording, config = jumping_alone(5.0, (25.0, 40.0), 45.0, off_m=2.0, sigma_m=0.01, slow=slow)
+    run, recording, config = jumping_alone(5.0, (12.0, 25.0), 27.0, off_m=2.0, sigma_m=0.01, slow=slow)
     stamps_ns = np.arange(run.truth.stamps_ns[0], run.truth.stamps_ns[-1], 200_000_000)
     true_mps = run.truth.at(stamps_ns).v_world_mps
     assert true_mps is not None
@@ -848,7 +854,7 @@ def test_a_wrong_fix_of_rtk_is_not_followed_beside_its_velocity() -> None:
     assert off.position_max_m < 1.5  # until the jump is detected, a second later
     assert off.position_rmse_m < 0.3
     assert any("gnss: position jump of 2 m" in w and "treated as its error" in w for w in live.stats.warnings)
-    wrong = live.trajectory.stamps_ns > run.truth.stamps_ns[0] + 27_000_000_000
+    wrong = live.trajectory.stamps_ns > run.truth.stamps_ns[0] + 14_000_000_000
     assert Health.GOOD not in [h for h, k in zip(live.health, wrong, strict=True) if k]
 
 

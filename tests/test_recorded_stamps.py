@@ -199,15 +199,23 @@ def test_a_clock_that_was_set_is_named_with_the_time(topic: str, by_s: float, wa
     assert line.startswith(f"{others}: the clock of {whose} was set {way} by {abs(by_s):.2f} s")
 
 
+@pytest.fixture(scope="module")
+def as_it_was(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, VesselConfig, Any]:
+    folder = tmp_path_factory.mktemp("right")
+    found, config, _ = look(folder, restamped({}), MAKE)
+    return found, config, read(folder, config)
+
+
 @pytest.mark.parametrize(("by_s", "set_s"), [(18, 5), (-18, 25), (1, 50), (-3600, 25)])
-def test_a_clock_that_is_set_by_whole_seconds_is_put_right(by_s: int, set_s: int, tmp_path: Path) -> None:
+def test_a_clock_that_is_set_by_whole_seconds_is_put_right(
+    by_s: int, set_s: int, as_it_was: tuple[Any, VesselConfig, Any], tmp_path: Path
+) -> None:
     """UTC and GPS time, a leap second, a time zone. It was told, and the vessel put where it was 18 s before; after an hour, all was lost."""
     wrong = lambda ns: ns + by_s * S * (ns >= START_NS + set_s * S)
     read_as = {}
-    for name, change in (("set", {"/fix": wrong}), ("right", {})):
-        (tmp_path / name).mkdir()
-        found, config, _ = look(tmp_path / name, restamped(change), MAKE)
-        recording = read(tmp_path / name, config)
+    seen, drafted, _ = look(tmp_path, restamped({"/fix": wrong}), MAKE)
+    both = {"set": (seen, drafted, read(tmp_path, drafted)), "right": as_it_was}
+    for name, (found, config, recording) in both.items():
         read_as[name] = config, [(m.stamp_ns, m.seq) for m in recording.measurements]
         for said in (w for w in (*found.warnings, *recording.warnings) if "the clock of" in w):
             assert f"by {abs(by_s)}.00 s at {utc_text(START_NS + set_s * S + WAY_NS['/fix'])}" in said
@@ -232,7 +240,7 @@ def test_messages_that_are_late_by_a_whole_second_are_of_no_clock_that_was_set()
 def test_messages_of_a_slow_sensor_in_bursts_are_of_no_clock_that_was_set(period_s: float) -> None:
     """Within a burst they come at once, and their stamps, seconds apart, seem to leap."""
     stamps_ns = START_NS + np.round(np.arange(0, 300) * period_s * S).astype(np.int64)
-    for each in range(2, 40):
+    for each in (2, 3, 4, 5, 7, 10, 15, 22, 31, 39):
         burst_ns = round(each * period_s * S)
         assert leaps(stamps_ns, (stamps_ns // burst_ns + 1) * burst_ns) == []
 

@@ -20,7 +20,7 @@ from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish
 from tests.slowly import slowly
 from tests.test_online_faults import run_of as run_with_matches
 
-SET_S, ENDS_S = 12.0, 24.0
+SET_S, ENDS_S = 12.0, 21.0
 HZ = 4.0
 
 

@@ -25,7 +25,7 @@ from graphloc.eval.simulate.bag import write_bag
 from graphloc.job import Job, Row, check, run_job, variations
 from tests.commands import called
 
-SHORT = Job(scenario="bl1-drift", changes=(("duration_s", "6"),))
+SHORT = Job(scenario="bl1-drift", changes=(("duration_s", "6"), ("imu_hz", "50")))
 BROKEN = replace(SHORT, config_changes=(("sensors.imu.enabled", "false"),))
 
 
@@ -139,7 +139,7 @@ def test_workers_give_what_this_process_gives(tmp_path: Path) -> None:
     assert [row["run"] for row in table] == [0, 1, 2]
     assert [bool(row["error"]) for row in table] == [False, True, False]
 
-    run = simulate(find_scenario("bl1-drift", {"duration_s": "6"}), 0)
+    run = simulate(find_scenario("bl1-drift", dict(SHORT.changes)), 0)
     track = app.simulated(run).solution.trajectory
     true = run.truth.at(run.truth.stamps_ns[track.covers(run.truth.stamps_ns)])
     off = (track.at(true.stamps_ns).p_world_m - true.p_world_m)[:, :2]
@@ -165,7 +165,10 @@ def test_a_scheduler_by_address_and_one_that_is_not_there(tmp_path: Path, monkey
         assert timeless(table) == timeless(run_job(BROKEN))
         monkeypatch.setattr(sweep, "run_job", killed)
         (row,) = sweep.sweep([SHORT], tmp_path / "d", scheduler=cluster.scheduler_address)
-        assert (row["case"], row["error"]) == ("bl1-drift duration_s=6", "its worker died: MemoryError: all of it")
+        assert (row["case"], row["error"]) == (
+            "bl1-drift duration_s=6 imu_hz=50",
+            "its worker died: MemoryError: all of it",
+        )
         monkeypatch.setattr(sweep, "_versions", lambda: {"thread": threading.current_thread().name})
         with pytest.raises(InputError, match="install the same"):
             sweep.sweep([BROKEN], tmp_path / "c", scheduler=cluster.scheduler_address)
@@ -217,7 +220,7 @@ def test_what_was_stopped_goes_on_and_ends_with_the_same_table(tmp_path: Path, m
 def test_a_bag_with_its_configuration_varied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten times the noise that fixes claim: the track must feel it. Another bag under the same name is refused."""
     bag, config = write_bag(
-        simulate(Scenario(duration_s=10.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3), tmp_path / "bag", ros=2
+        simulate(Scenario(duration_s=8.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3), tmp_path / "bag", ros=2
     )
     job = Job(bag=str(bag), config=str(config))
     jobs = [replace(job, config_changes=(("sensors.gnss.sigma_scale", k),)) for k in ("1", "10")]
