@@ -238,6 +238,13 @@ def test_a_velocity_is_turned_to_east_north_up(msgtype: str) -> None:
         np.testing.assert_allclose(as_it_is.v_enu_mps, [3.0, -1.0, 0.5], atol=1e-6)
 
 
+def test_an_up_of_exactly_0_is_measured_where_a_receiver_says_so() -> None:
+    """Whole mm/s: in calm water one velocity in some tens. In a standard message it is what a driver of NMEA leaves."""
+    fields, sigma = VELOCITIES[UBX + "NavPVT"]
+    found = read("gnss_velocity", UBX + "NavPVT", {**fields, "vel_d": 0})
+    assert found.cov_m2ps2[2, 2] == pytest.approx(sigma**2)
+
+
 @pytest.mark.parametrize("msgtype", HEADINGS)
 def test_a_heading_is_turned_to_a_yaw(msgtype: str) -> None:
     fields, sigma_deg = HEADINGS[msgtype]
