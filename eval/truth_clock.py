@@ -14,7 +14,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import correlate
 
 from graphloc.eval.formatting import number
 from graphloc.frames import Array
@@ -73,6 +72,8 @@ class ClockApart(NamedTuple):
 
 def clock_apart(track: Trajectory, truth: Trajectory) -> ClockApart | None:
     """Return how far a truth's clock is off the track's; None if it is not, or the motion does not show it."""
+    from scipy.signal import correlate  # takes a second to import, also for commands that have no truth
+
     seen = _velocities(track), _velocities(truth)
     if seen[0] is None or seen[1] is None:
         return None

@@ -3,6 +3,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -28,11 +29,14 @@ from graphloc.recording import Recording, quiet
 from graphloc.solution import Health, Solution
 from graphloc.solve import _first_solution, wrong_imu
 from graphloc.solve._start import Begun
+from tests import test_online_faults as faults
 from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish
 from tests.slowly import slowly
-from tests.test_online_faults import at_s, begun, run_of
+from tests.test_online_faults import at_s
 
 S = 1_000_000_000
+RATE_HZ = 2.5  # of states: with fewer, what the IMU is blamed for is not told in 4 s
+run_of, begun = partial(faults.run_of, rate_hz=RATE_HZ), partial(faults.begun, rate_hz=RATE_HZ)
 Change = Callable[[Measurement], Measurement]
 
 

@@ -46,8 +46,8 @@ def setup_of(config: VesselConfig) -> Setup:
 
 
 @cache
-def run_of(seed: int = 0, length_s: float = 26.0) -> SimulatedRun:
-    return _seldom(replace(bl_scenario(1, "drift"), false_fraction=0.1, duration_s=length_s), seed)
+def run_of(seed: int = 0, length_s: float = 26.0, rate_hz: float = RATE_HZ) -> SimulatedRun:
+    return _seldom(replace(bl_scenario(1, "drift"), false_fraction=0.1, duration_s=length_s), seed, rate_hz)
 
 
 def _seldom(scenario: Scenario, seed: int, rate_hz: float = RATE_HZ) -> SimulatedRun:
@@ -69,14 +69,15 @@ def whole(arrivals: Arrivals, online: OnlineSmoother | None = None) -> Fed:
 
 
 @cache
-def _begun(t_s: float) -> tuple[OnlineSmoother, Fed]:
-    online, arrivals = smoother(run_of()), arrivals_of(run_of())
-    return online, feed(online, run_of(), arrivals[: at_s(arrivals, t_s)])
+def _begun(t_s: float, rate_hz: float) -> tuple[OnlineSmoother, Fed]:
+    run = run_of(rate_hz=rate_hz)
+    online, arrivals = smoother(run), arrivals_of(run)
+    return online, feed(online, run, arrivals[: at_s(arrivals, t_s)])
 
 
-def begun(t_s: float) -> tuple[OnlineSmoother, Fed]:
+def begun(t_s: float, rate_hz: float = RATE_HZ) -> tuple[OnlineSmoother, Fed]:
     """A smoother that was fed the first seconds of the run, and what came of it: most of the time is the start's."""
-    online, fed = _begun(t_s)
+    online, fed = _begun(t_s, rate_hz)
     return copied(online), fed.copied()
 
 
