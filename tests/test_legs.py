@@ -19,7 +19,7 @@ from graphloc.frames import heading_deg_from_yaw, wrap_angle
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement, PoseFix
 from graphloc.recording import Recording
 from graphloc.solution import Solution
-from graphloc.solve._legs import overlap_ns, seams
+from graphloc.solve._legs import _own, overlap_ns, seams, solve_legs
 from tests.slowly import sparsely
 
 S = 10**9
@@ -105,6 +105,26 @@ def test_every_message_has_one_row_and_every_state_its_values(whole: Solution, l
         assert (np.diff(slow.stamps_ns) > 0).all()
         assert len(slow.value) == len(slow.stamps_ns) == len(slow.sigma)
         assert len(slow.stamps_ns) == pytest.approx(len(whole.slow[name].stamps_ns), abs=4)
+
+
+def test_no_time_is_missing_at_a_seam_of_legs_that_are_not_in_step(run: SimulatedRun, whole: Solution) -> None:
+    """The last state before it and the first one after it were nearly two intervals apart."""
+    stamps = whole.trajectory.stamps_ns
+    longest, k = int(np.diff(stamps).max()), len(stamps) // 2
+    out_of_step = int(0.7 * (stamps[k + 1] - stamps[k]))
+    shifts = iter([0, out_of_step])
+
+    def solve(part: Recording, _heading_deg: float | None) -> Solution:
+        assert part.imu is not None
+        first, last = (int(ns) for ns in part.imu.stamps_ns[[0, -1]])
+        leg = _own(whole, first, last, last, None)
+        track = replace(leg.trajectory, stamps_ns=leg.trajectory.stamps_ns + next(shifts))
+        return replace(leg, trajectory=track)
+
+    legs, _ = solve_legs(run.recording, [int(stamps[k]) + out_of_step + 1], LEG_S, solve)
+    apart = np.diff(np.concatenate([leg.trajectory.stamps_ns for leg in legs]))
+    assert (apart > 0).all()
+    assert apart.max() <= longest
 
 
 def test_seams_keep_away_from_an_outage(run: SimulatedRun) -> None:

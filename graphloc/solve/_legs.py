@@ -92,15 +92,23 @@ def solve_legs(
     edges = [np.iinfo(np.int64).min // 2, *seams_ns, np.iinfo(np.int64).max // 2]
     legs: list[Solution] = []
     heading_deg, before, apart = None, None, Apart()
-    for begin, end in pairwise(edges):
+    for number, (begin, end) in enumerate(pairwise(edges)):
         whole = solve(_between(recording, begin - over, end + over), heading_deg)
         if before is not None:
             apart = _farther(apart, before, whole, begin)
+            legs.append(_own(before, edges[number - 1], begin, _first_after(whole, begin), legs[-1] if legs else None))
         heading_deg = _known_heading_deg(whole, np.array([end - over]))
-        legs.append(_own(whole, begin, end, legs[-1] if legs else None))
         before = whole
         give_back_memory()
-    return legs, apart
+    assert before is not None
+    return [*legs, _own(before, edges[-2], edges[-1], edges[-1], legs[-1] if legs else None)], apart
+
+
+def _first_after(leg: Solution, stamp_ns: int) -> int:
+    """Return the stamp of the first state of a leg from a stamp on; that stamp if there is none."""
+    stamps_ns = leg.trajectory.stamps_ns
+    k = int(np.searchsorted(stamps_ns, stamp_ns))
+    return int(stamps_ns[k]) if k < len(stamps_ns) else stamp_ns
 
 
 def _known_heading_deg(leg: Solution, at_ns: NDArray[np.int64]) -> float | None:
@@ -133,13 +141,19 @@ def _farther(apart: Apart, before: Solution, after: Solution, at_ns: int) -> Apa
     return Apart(max(apart.m, off_m), max(apart.deg, off_deg), apart.within and within)
 
 
-def _own(leg: Solution, begin_ns: int, end_ns: int, before: Solution | None) -> Solution:
-    """Return the solution of a leg, cut to its own time."""
+def _own(leg: Solution, begin_ns: int, end_ns: int, until_ns: int, before: Solution | None) -> Solution:
+    """Return the solution of a leg, cut to its own time.
+
+    Args:
+        begin_ns, end_ns: of that time. until_ns: first state of the next leg. States of two legs are not in step, so between the last one
+            before a seam and the first one after it there may be nearly two intervals.
+        before: the leg before; None: there is none.
+    """
 
     def mine(stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         return np.asarray((stamps_ns >= begin_ns) & (stamps_ns < end_ns))
 
-    own = mine(leg.trajectory.stamps_ns)
+    own = np.asarray((leg.trajectory.stamps_ns >= begin_ns) & (leg.trajectory.stamps_ns < until_ns))
     kept = leg.trajectory.where(own)
     since = {name: s[own] for name, s in leg.since_agreed_s.items()}
     if before is not None:
