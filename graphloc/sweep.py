@@ -84,8 +84,9 @@ def sweep(
 
 def _inputs(jobs: Sequence[Job], folder: Path, overwrite: bool) -> dict[str, str]:
     """Return the hashes of all inputs, with those of a sweep that is continued; refuse a folder that cannot be used."""
-    paths = sorted({path for job in jobs for path in (job.bag, job.config) if path})
-    hashes = {path: app.sha256(Path(path)) for path in paths}
+    pairs = sorted({(job.bag, job.config) for job in jobs if job.config})
+    paths = {path for bag, config in pairs for path in app.inputs_of([Path(bag)], Path(config))}
+    hashes = {str(path): app.sha256(path) for path in sorted(paths)}
     mark = folder / MARK
     if mark.exists() and not overwrite:
         try:

@@ -1,6 +1,7 @@
 """The command line as its user meets it: whole runs, one clear line for bad input, nothing half-written."""
 
 import errno
+import hashlib
 import json
 import os
 import signal
@@ -59,6 +60,9 @@ def test_smooth_writes_a_run_folder_and_does_not_replace_it_unasked(
     assert numbers["Against truth"]["graphloc"]["position_rmse_m"] < 0.5
     assert printed.rstrip().endswith("report.html")
     _its_bag_holds_the_track(out)
+    hashes = json.loads((out / "run.json").read_text())["inputs_sha256"]
+    assert hashes[str(bag[1])] == hashlib.sha256(bag[1].read_bytes()).hexdigest()
+    assert {Path(file).name for file in hashes} == {bag[0].name, bag[1].name}
     before = (out / "solution.csv").read_bytes()
 
     monkeypatch.setattr("graphloc.app.load", lambda *_: pytest.fail("refused only after the bag was read"))

@@ -218,10 +218,12 @@ def test_what_was_stopped_goes_on_and_ends_with_the_same_table(tmp_path: Path, m
 
 
 def test_a_bag_with_its_configuration_varied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten times the noise that fixes claim: the track must feel it. Another bag under the same name is refused."""
+    """Ten times the noise that fixes claim: the track must feel it. Another file under the same name is refused."""
     bag, config = write_bag(
         simulate(Scenario(duration_s=8.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3), tmp_path / "bag", ros=2
     )
+    (config.parent / "map.png").write_bytes(b"quay")
+    config.write_text(config.read_text() + "\noutput: {map_image: map.png}\n")
     job = Job(bag=str(bag), config=str(config))
     jobs = [replace(job, config_changes=(("sensors.gnss.sigma_scale", k),)) for k in ("1", "10")]
     monkeypatch.setattr(sweep, "_on_dask", in_process([]))
@@ -229,7 +231,7 @@ def test_a_bag_with_its_configuration_varied(tmp_path: Path, monkeypatch: pytest
     assert (first["config.sensors.gnss.sigma_scale"], second["config.sensors.gnss.sigma_scale"]) == ("1", "10")
     assert first["messages"] == second["messages"]
     assert first["position_rmse_m"] != second["position_rmse_m"]
-    config.write_text(config.read_text() + "\n")
+    (config.parent / "map.png").write_bytes(b"quay, rebuilt")
     with pytest.raises(OutputError, match="other versions or inputs"):
         sweep.sweep(jobs, tmp_path / "s")
     config.write_text(config.read_text().replace("truth_topic: /truth", ""))

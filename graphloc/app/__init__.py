@@ -19,7 +19,7 @@ from graphloc.app._estimate import (
     with_synthetic,
 )
 from graphloc.app._run import Run, antennas
-from graphloc.app._written import report_data, sha256, tables, truth_statement, write
+from graphloc.app._written import inputs_of, report_data, sha256, tables, truth_statement, write
 from graphloc.gather import Scans
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "antennas",
     "choose_datum",
     "configured",
+    "inputs_of",
     "load",
     "match_at",
     "online_smoother",

@@ -11,10 +11,12 @@ from pathlib import Path
 
 from graphloc import found_tags, outputs
 from graphloc.app._run import Run, antennas
+from graphloc.config import load_config
 from graphloc.eval import metrics, report
 from graphloc.eval.docking import docking_table
 from graphloc.eval.ekf import named_tracks
 from graphloc.eval.holdout import suggested
+from graphloc.factors import KINDS
 from graphloc.folders import fresh_folder
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, TagSighting
@@ -158,6 +160,12 @@ def write(
             (fresh / "figures").mkdir()
             write_figures(tuple(report.figures(data).values()), fresh / "figures")
     return folder / "report.html"
+
+
+def inputs_of(bags: Sequence[Path], config_path: Path) -> tuple[Path, ...]:
+    """Return what a run was made of: bags, vessel.yaml, and the files that it names (images, surveys, truth)."""
+    named = load_config(config_path, KINDS).files
+    return *bags, config_path, *(config_path.parent / file for file in named)
 
 
 def sha256(path: Path) -> str:

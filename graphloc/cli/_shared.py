@@ -164,7 +164,12 @@ class RunOptions(FolderOptions):
 
         command = " ".join(sys.argv[1:])
         page = application.write(
-            run, self.out, inputs=self.bag, command=command, overwrite=self.overwrite, figures=self.figures
+            run,
+            self.out,
+            inputs=application.inputs_of(self.bag, self.config),
+            command=command,
+            overwrite=self.overwrite,
+            figures=self.figures,
         )
         if self.rerun is not None:
             rerun_log.write_rerun(

@@ -157,6 +157,11 @@ class AerialConfig(AnyPoseConfig):
         """How far off in time scans may be that are matched together, s; BL matches single ones."""
         return 0.5 * self.submap_s if self.matcher == "posterior" else 0.0
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Image and lines."""
+        return self.image, self.vector
+
     @field_validator("topic", "mount")
     @classmethod
     def _of_the_lidars(cls, given: str | MountConfig) -> str | MountConfig:
@@ -243,6 +248,11 @@ class AprilTagConfig(SensorConfig):
         if given not in ("", MountConfig()):
             raise ValueError("not used here: set it for each of `cameras`")
         return given
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Its survey, while it is not read."""
+        return (self.survey,) if isinstance(self.survey, str) else ()
 
     @property
     def surveyed(self) -> Survey:

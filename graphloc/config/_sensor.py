@@ -93,6 +93,11 @@ class SensorConfig(Block):
         return True
 
     @property
+    def files(self) -> tuple[str, ...]:
+        """The files that it names, for `VesselConfig.files`."""
+        return ()
+
+    @property
     def takes_turns(self) -> bool:
         """Whether it is one of those that read a receiver's fixes by turns (`VesselConfig.by_turns`)."""
         return False

@@ -181,6 +181,12 @@ class VesselConfig(Block):
         """Topic or file of the truth; empty: there is none."""
         return self.truth_topic or self.truth_file
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files that it names, once each, as written: a relative path starts at the folder of vessel.yaml."""
+        named = [file for sensor in self.sensors.values() if sensor.enabled for file in sensor.files]
+        return tuple(dict.fromkeys(file for file in (*named, self.output.map_image, self.truth_file) if file))
+
     def with_sensors(self, changed: Mapping[str, Any]) -> VesselConfig:
         """Return the configuration with some of its sensors replaced."""
         return self.model_copy(update={"sensors": {**self.sensors, **changed}})
