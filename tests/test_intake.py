@@ -1,6 +1,7 @@
 """Which IMU samples are taken: stamps that jump, clocks that are set back, late samples; none is lost or taken twice."""
 
 import numpy as np
+import pytest
 
 from graphloc.measurements import ImuSample
 from graphloc.online._intake import ImuIntake, Taken
@@ -9,14 +10,16 @@ MS = 1_000_000
 GRAVITY = np.array([0.0, 0.0, 9.81])
 
 
-def sample(at_ms: float, seq: int = 0) -> ImuSample:
+def sample(at_ms: float, seq: int = 0, reading: float = 0.0) -> ImuSample:
+    """A sample at rest; `reading`: what tells it from others."""
+    force_mps2 = GRAVITY + [1e-6 * reading, 0.0, 0.0]
     return ImuSample(
-        stamp_ns=round(at_ms * MS), sensor="imu", seq=seq, accel_mps2=GRAVITY, gyro_radps=np.zeros(3)
+        stamp_ns=round(at_ms * MS), sensor="imu", seq=seq, accel_mps2=force_mps2, gyro_radps=np.zeros(3)
     )  # fmt: skip
 
 
-def fed(intake: ImuIntake, at_ms: float, *, started: bool = True, seq: int = 0) -> Taken:
-    taken = intake.take(sample(at_ms, seq), started=started)
+def fed(intake: ImuIntake, at_ms: float, *, started: bool = True, seq: int = 0, reading: float = 0.0) -> Taken:
+    taken = intake.take(sample(at_ms, seq, reading), started=started)
     for m in taken.accepted:
         intake.accept(m)
     return taken
@@ -66,8 +69,33 @@ def test_a_clock_that_is_set_back_is_believed_after_fifty() -> None:
     for k in range(49):
         assert fed(intake, -9000.0 + 10.0 * k).dropped
     found = fed(intake, -8510.0)
-    assert found.set_back_s == (990.0 + 8510.0) / 1e3
+    assert found.set_back_s == (990.0 + 9000.0) / 1e3
     assert len(found.accepted) == 1
+
+
+@pytest.mark.parametrize("started", [True, False])
+@pytest.mark.parametrize("back_ms", [300.0, 1003.0, 1500.0])
+def test_a_clock_that_is_set_back_among_the_stamps_in_use_is_believed_after_ten(back_ms: float, started: bool) -> None:
+    """After a step of 0.3 s the stamps have caught up within 30 samples: nothing was said, and the vessel is 0.3 s ahead."""
+    intake, newest_ms = ImuIntake(0.2, floats=True), 3000.0
+    for at_ms in np.arange(0.0, newest_ms + 1.0, 10.0):
+        fed(intake, at_ms, started=started, reading=at_ms)
+    came_ms = newest_ms - back_ms + 10.0 * np.arange(1, 11)
+    found = [fed(intake, at_ms, started=started, reading=5000.0 + at_ms) for at_ms in came_ms]
+    assert not any(taken.accepted or taken.set_back_s for taken in found[:-1])
+    assert found[-1].set_back_s == pytest.approx((back_ms - 10.0) / 1e3)
+    assert len(found[-1].accepted) == 1
+
+
+def test_samples_that_are_sent_again_set_no_clock_back() -> None:
+    """A bridge that reconnects repeats its buffer; samples that overtake each other come in no order."""
+    intake = ImuIntake(0.2, floats=True)
+    for k in range(300):
+        fed(intake, 10.0 * k, reading=float(k))
+    assert all(fed(intake, 10.0 * k, reading=float(k)).dropped for k in range(255, 295))
+    assert fed(intake, 3000.0, reading=300.0).accepted
+    backwards = [fed(intake, 10.0 * k + 3.0, reading=0.5 + k) for k in range(290, 250, -1)]
+    assert all(taken.dropped and not taken.set_back_s for taken in backwards)
 
 
 def test_none_is_lost_and_none_taken_twice() -> None:

@@ -18,7 +18,9 @@ from graphloc.signals.frozen_imu import FROZEN_IMU, FrozenImuDetector
 from graphloc.signals.imu_spikes import IMU_SPIKE, SpikeDetector
 from graphloc.time import stamps_of
 
-_BACK = 50  # samples in a row with stamps before the newest: the clock was set back
+# The clock was set back where so many samples in a row lie before the newest: by more than a gap, as they may be sent again; or in
+# order, among those in use where none is missing, with other readings. A clock that is set back by less catches up before.
+_BACK, _AMONG = 50, 10
 _LATE_S = 3.0  # how late samples may come before the start
 _HOLE = 0.7  # share of the IMU's period: where no sample lies so near to either side, one is missing
 _FORCE_MPS2, _RATE_RADPS = (2.0, 100.0), 10.0  # limits for a vessel; readings in g or deg/s fall outside
@@ -50,6 +52,25 @@ class Taken(NamedTuple):
     set_back_s: float = 0.0
 
 
+class _Row(NamedTuple):
+    """Samples in a row before the newest.
+
+    Attributes:
+        stamp_ns: of the last. back_ns: how far the first lay before the newest at most. far: how many lay farther back than a gap.
+        among: how many in order lay among samples in use, where none is missing.
+    """
+
+    stamp_ns: int = 0
+    back_ns: int = 0
+    far: int = 0
+    among: int = 0
+
+    def with_sample(self, stamp_ns: int, back_ns: int, *, far: bool, among: bool) -> _Row:
+        """Return the row with another sample."""
+        in_order = self.among if stamp_ns > self.stamp_ns else 0
+        return _Row(stamp_ns, max(self.back_ns, back_ns), self.far + far, in_order + among)
+
+
 def series_of(samples: Sequence[ImuSample]) -> ImuSeries:
     """Return samples of one IMU as a series."""
     return ImuSeries(
@@ -79,16 +100,21 @@ class ImuIntake:
         self.newest: ImuSample | None = None
         # Held back until others follow it, so that one wrong stamp does not end the estimate.
         self.jumped: ImuSample | None = None
-        self._jumped_age = self._behind = 0
+        self._jumped_age = 0
+        self._row = _Row()
         self._frozen, self._spikes = FrozenImuDetector(), SpikeDetector()
         self._spiked = False
         self._stamps: list[int] = []  # of the samples in use, in order, as far back as a late one may lie
+        self._readings: dict[int, bytes] = {}  # of the newest samples in use, by stamp
 
     def accept(self, m: ImuSample) -> float:
         """Make a sample the newest; return the time (s) since the one before it."""
         before, self.newest = self.newest, m
-        self._behind = 0
+        self._row = _Row()
         self._stamps.append(m.stamp_ns)
+        self._readings[m.stamp_ns] = m.accel_mps2.tobytes()
+        if len(self._readings) > _PERIODS:
+            del self._readings[next(iter(self._readings))]
         return 0.0 if before is None else (m.stamp_ns - before.stamp_ns) * 1e-9
 
     def restart(self, stamps_ns: list[int]) -> None:
@@ -162,14 +188,18 @@ class ImuIntake:
         n = bisect_left(stamps, m.stamp_ns)
         period_ns = float(np.quantile(np.diff(stamps[-_PERIODS:]), 0.1)) if len(stamps) > 2 else np.inf
         apart_ns = min((abs(m.stamp_ns - stamp) for stamp in stamps[max(n - 1, 0) : n + 1]), default=0)
-        new = apart_ns > 0 and newest.stamp_ns - m.stamp_ns < _LATE_S * 1e9  # before the start no period is known
-        if (n > 0 and apart_ns >= _HOLE * period_ns) or (not started and new):
+        missing = n > 0 and apart_ns >= _HOLE * period_ns
+        back_ns = newest.stamp_ns - m.stamp_ns
+        again = self._readings.get(m.stamp_ns) == m.accel_mps2.tobytes()
+        row = self._row = self._row.with_sample(
+            m.stamp_ns, back_ns, far=back_ns > self._gap_ns, among=n > 0 and not missing and not again
+        )
+        if row.far >= _BACK or row.among >= _AMONG:
+            self.newest = None
+            return Taken(accepted=(m,), set_back_s=row.back_ns * 1e-9)
+        # Before the start no period is known.
+        if missing or (not started and apart_ns > 0 and back_ns < _LATE_S * 1e9):
             hole = (stamps[n - 1], stamps[n]) if n > 0 else None
             stamps.insert(n, m.stamp_ns)
             return Taken(late=m, hole=hole)
-        # After a smaller step back, the clock soon catches up with the newest stamp, and the gap is bridged.
-        self._behind += newest.stamp_ns - m.stamp_ns > self._gap_ns
-        if self._behind < _BACK:
-            return Taken(dropped=((m, _BEHIND),))
-        self.newest = None
-        return Taken(accepted=(m,), set_back_s=(newest.stamp_ns - m.stamp_ns) * 1e-9)
+        return Taken(dropped=((m, _BEHIND),))
