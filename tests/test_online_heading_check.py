@@ -121,11 +121,13 @@ def said_of(
     before_ns: int = 0,
     late_ns: int = 0,
     hangs_s: tuple[float, float] = (0.0, 0.0),
+    other_until_s: float = 0.0,
+    receivers: int = 1,
 ) -> list[str]:
     """What is said of an estimate that is right but for its heading, where the fixes are 8 m further east for a while.
 
     `before_ns`: stamp of a state before, by a clock that was then set back. `late_ns`: by how much the fixes are stamped late. `hangs_s`: when
-    the receiver repeats a fix.
+    the receiver repeats a fix. `other_until_s`: until when another sensor has the fixes, of the same receiver or of another.
     """
     datum, of_imu = app.choose_datum(run.recording, run.config), run.config.sensors["imu"].mount
     assert run.recording.imu is not None
@@ -141,8 +143,10 @@ def said_of(
     stream = SimpleNamespace(
         row=gnss.ROW, config=antenna, mount=gtsam.Pose3(gtsam.Rot3(), lever), receiver=receiver, frozen_detector=FrozenReceiverDetector()
     )  # fmt: skip
+    by_turns = SimpleNamespace(receiver_of=lambda name: name if receivers > 1 else "gnss")
     problem = SimpleNamespace(
-        streams={"gnss": stream}, datum=datum, links=links, R_body_imu=of_imu.R_body_sensor, t_body_imu_m=of_imu.t_body_sensor_m
+        streams={"gnss": stream, "other": stream}, config=by_turns, datum=datum, links=links, R_body_imu=of_imu.R_body_sensor,
+        t_body_imu_m=of_imu.t_body_sensor_m,
     )  # fmt: skip
     begin_ns = int(run.truth.stamps_ns[0])
     waiting = deque(replace(m, stamp_ns=m.stamp_ns + late_ns) for m in run.recording.of(GnssPosition))
@@ -168,6 +172,8 @@ def said_of(
             if hangs_s[0] <= since_s < hangs_s[1]:
                 m = replace(m, position=last.position)
             last = m
+            if since_s < other_until_s:
+                m = replace(m, sensor="other")
             hint = gnss.ROW.hint(m, 0.0, datum)
             receiver.repeated_fix.note(m.stamp_ns, hint.p_world_m[:2], (R.T @ v_mps)[:2], 0.1)
             check.note(m, lag)
@@ -199,6 +205,18 @@ def test_a_receiver_that_hangs_neither_hides_a_wrong_heading_nor_makes_one(
     """Its fixes had been rejected, and yet counted here: on a boat a heading right to 0.3 deg was said to be off by 171 deg."""
     assert len(said_of(at_two_hertz, (0.0, 0.0), np.radians(70.0), hangs_s=(10.0, 25.0))) == 1
     assert said_of(in_loops, (0.0, 0.0), 0.0, hangs_s=(30.0, 45.0)) == []
+
+
+@pytest.mark.parametrize(("receivers", "other_until_s"), [(1, 35.0), (2, 15.0)], ids=["by turns", "the other dies"])
+def test_the_fixes_of_another_sensor_count_where_it_reads_the_receiver_or_has_more(
+    receivers: int, other_until_s: float, at_two_hertz: SimulatedRun
+) -> None:
+    """The first sensor that was heard was the only one for good: a receiver that finds RTK after 25 s was never checked again."""
+    found = [
+        said_of(at_two_hertz, (0.0, 0.0), off_rad, other_until_s=other_until_s, receivers=receivers)
+        for off_rad in (np.radians(70.0), 0.0)
+    ]
+    assert [len(said) for said in found] == [1, 0]
 
 
 def test_fixes_that_are_late_make_no_wrong_heading(in_loops: SimulatedRun) -> None:

@@ -83,15 +83,16 @@ class Fit(NamedTuple):
 
 
 class _Fix(NamedTuple):
-    """A fix: place (2,) in world and its sigma, m."""
+    """A fix: its sensor, place (2,) in world and its sigma, m."""
 
     stamp_ns: int
+    sensor: str
     p_world_m: Array
     sigma_m: float
 
 
 class HeadingCheck:
-    """Compares the fixes of one receiver with the steps of the IMU.
+    """Compares the fixes of a receiver, of several that with the most, with the steps of the IMU.
 
     Attributes:
         said: what is wrong with the heading, in words; empty where nothing is known to be wrong.
@@ -103,8 +104,7 @@ class HeadingCheck:
     def __init__(self) -> None:
         self.said, self.off_rad, self.within_rad = "", 0.0, np.inf
         self._steps: deque[_Step] = deque()
-        self._fixes: deque[_Fix] = deque()
-        self._sensor = ""
+        self._fixes: dict[str, deque[_Fix]] = {}  # by receiver
         self.looked_ns, self._wrong, self._right, self._fits = 0, 0, 0, 0
 
     def begin(self) -> None:
@@ -123,20 +123,16 @@ class HeadingCheck:
         return self._fits >= _IN_A_ROW
 
     def note(self, m: Measurement, lag: Lag) -> None:
-        """Take in a position, if it is of the first absolute sensor without hypotheses (GNSS) that is not frozen."""
+        """Take in a position, if it is of an absolute sensor without hypotheses (GNSS) that is not frozen."""
         stream = lag.problem.streams.get(m.sensor)
-        if (
-            stream is None
-            or not stream.row.absolute
-            or stream.row.has_hypotheses
-            or stream.frozen_detector.frozen
-            or self._sensor not in ("", m.sensor)
-        ):
+        if stream is None or not stream.row.absolute or stream.row.has_hypotheses or stream.frozen_detector.frozen:
             return
         hint = stream.row.hint(m, 0.0, lag.problem.datum)
         if np.isfinite(hint.p_world_m[:2]).all():
-            self._sensor = m.sensor
-            self._fixes.append(_Fix(m.stamp_ns, hint.p_world_m[:2], float(hint.p_sigma_m[:2].max())))
+            fix = _Fix(m.stamp_ns, m.sensor, hint.p_world_m[:2], float(hint.p_sigma_m[:2].max()))
+            noted = self._fixes.setdefault(lag.problem.config.receiver_of(m.sensor), deque())
+            if not noted or m.stamp_ns > noted[-1].stamp_ns:  # a restart takes the last ones in again
+                noted.append(fix)
 
     def look(self, lag: Lag, *, guessed: bool = False) -> bool:
         """Integrate the IMU to the newest state and check the heading; return whether it is newly found to be wrong.
@@ -150,13 +146,11 @@ class HeadingCheck:
         if not self._steps or 0 <= since_ns < _EVERY_S * 1e9:  # less than 0: the clock was set back
             return False
         self.looked_ns, self.within_rad = newest.stamp_ns, np.inf
-        if self._sensor not in lag.problem.streams:
+        fixes = self._most_fixes(lag)
+        if not fixes:
             return False
-        # That a fix is a repetition may turn out only after it was noted.
-        repeated = lag.problem.streams[self._sensor].receiver.repeated_fix
-        self._fixes = deque(fix for fix in self._fixes if not repeated.is_old(fix.stamp_ns, fix.p_world_m))
         # The estimated bias is not taken off: a wrong heading bends it until it fits.
-        fit = self._fit(lag, newest, np.zeros(3), any_place=guessed)
+        fit = self._fit(lag, newest, fixes, np.zeros(3), any_place=guessed)
         self.within_rad = _within_rad(fit)
         found = _off(fit)
         if found is None:
@@ -166,8 +160,11 @@ class HeadingCheck:
         if _turned(*found):
             up = newest.pose.rotation().matrix()[2]
             drift = up * float(up @ lag.problem.R_body_imu @ newest.bias.gyroscope())
-            for by, late in ((drift, False), *(((np.zeros(3), True), (drift, True)) if self._may_be_late(lag) else ())):
-                told = _off(self._fit(lag, newest, by, late=late))
+            for by, late in (
+                (drift, False),
+                *(((np.zeros(3), True), (drift, True)) if _may_be_late(lag, fixes[-1].sensor) else ()),
+            ):
+                told = _off(self._fit(lag, newest, fixes, by, late=late))
                 if told is not None and not _turned(*told):
                     found = told
                     break
@@ -185,7 +182,7 @@ class HeadingCheck:
         if self._wrong >= _IN_A_ROW:
             self.off_rad = found[0]
             self.said = was or (
-                f"the heading is off by about {np.degrees(self.off_rad):.0f} deg, by the IMU's accelerations and the fixes of {self._sensor}: "
+                f"the heading is off by about {np.degrees(self.off_rad):.0f} deg, by the IMU's accelerations and the fixes of {fixes[-1].sensor}: "
                 "check what measures the heading (convention, mount), if anything does, and the IMU's axes"
             )
         elif self._right >= _IN_A_ROW:
@@ -211,31 +208,49 @@ class HeadingCheck:
         begin_ns = until_ns - round(_WINDOW_S * 1e9)
         while self._steps[0].from_ns < begin_ns:
             self._steps.popleft()
-        while self._fixes and self._fixes[0].stamp_ns < begin_ns:
-            self._fixes.popleft()
+        for noted in self._fixes.values():
+            while noted and noted[0].stamp_ns < begin_ns:
+                noted.popleft()
 
-    def _may_be_late(self, lag: Lag) -> bool:
-        """Return whether the stamps of the fixes may be off; a sensor of whole poses has no such setting."""
-        return float(getattr(lag.problem.streams[self._sensor].config, "stamp_sigma_s", 0.0)) > 0.0
+    def _most_fixes(self, lag: Lag) -> list[_Fix]:
+        """Return the fixes of the window, of the receiver that has the most."""
+        for receiver, noted in self._fixes.items():
+            # That a fix is a repetition may turn out only after it was noted.
+            self._fixes[receiver] = deque(
+                fix
+                for fix in noted
+                if fix.sensor in lag.problem.streams
+                and not lag.problem.streams[fix.sensor].receiver.repeated_fix.is_old(fix.stamp_ns, fix.p_world_m)
+            )
+        return list(max(self._fixes.values(), key=len, default=()))
 
     def _fit(
-        self, lag: Lag, newest: Newest, drift_radps: Array, *, any_place: bool = False, late: bool = False
+        self,
+        lag: Lag,
+        newest: Newest,
+        noted: list[_Fix],
+        drift_radps: Array,
+        *,
+        any_place: bool = False,
+        late: bool = False,
     ) -> Fit | None:
         """Return the fit of rho; None where there are too few fixes, or the data are too short.
 
         Args:
+            noted: fixes of one receiver.
             drift_radps: (3,) gyroscope bias to take off, body axes. any_place: whether to fit where the antenna is
                 about its mount (h).
             late: whether to fit a delay of the fixes.
         """
         # A sensor of whole poses has no antenna.
-        place_m = getattr(lag.problem.streams[self._sensor].config, "mount_sigma_m", 0.0) if any_place else 0.0
-        at_s, regressors = self._reckoned(lag, newest, drift_radps, place_m)
+        sensor = noted[-1].sensor
+        place_m = getattr(lag.problem.streams[sensor].config, "mount_sigma_m", 0.0) if any_place else 0.0
+        at_s, regressors = self._reckoned(lag, newest, sensor, drift_radps, place_m)
         prior_sigmas = np.append(_BIASES, [place_m] if place_m else [])
         if late:
             regressors = np.vstack([regressors, np.gradient(regressors[0], at_s)])
             prior_sigmas = np.append(prior_sigmas, _LATE_S)
-        fixes = [fix for fix in self._fixes if self._steps[0].until_ns <= fix.stamp_ns <= newest.stamp_ns]
+        fixes = [fix for fix in noted if self._steps[0].until_ns <= fix.stamp_ns <= newest.stamp_ns]
         if at_s[-1] - at_s[0] < 0.9 * _WINDOW_S or len(fixes) < _FEWEST:
             return None
         stamps_ns = stamps_of(fixes)
@@ -254,8 +269,10 @@ class HeadingCheck:
         sigma_m = float(np.sqrt(np.mean(np.abs(residual) ** 2) * len(observed) / independent))
         return first_of(design, observed, sigma_m, prior_sigmas)
 
-    def _reckoned(self, lag: Lag, newest: Newest, drift_radps: Array, place_m: float) -> tuple[Array, Array]:
-        """Dead-reckon the antenna by the steps of the IMU, from rest.
+    def _reckoned(
+        self, lag: Lag, newest: Newest, sensor: str, drift_radps: Array, place_m: float
+    ) -> tuple[Array, Array]:
+        """Dead-reckon the antenna of a sensor by the steps of the IMU, from rest.
 
         Args:
             drift_radps: as in `_fit`. place_m: how far from its mount the antenna may be, 1 sigma; 0: take it where the
@@ -265,7 +282,7 @@ class HeadingCheck:
             Times (N,), s, relative to the newest state; and (3 or 4, N) complex: reckoned, ahead2, ahead3 and, where
             `place_m` is not 0, ahead, in axes of world by the newest state's attitude.
         """
-        lever_m = _mount_m(lag, self._sensor) if place_m else _lever_m(lag, self._sensor)
+        lever_m = _mount_m(lag, sensor) if place_m else _lever_m(lag, sensor)
         # In the body's axes at the first step ("start"), without gravity.
         R_start_body, v_mps, p_m = np.eye(3), np.zeros(3), np.zeros(3)
         antenna_m, bow = [], []
@@ -300,6 +317,11 @@ def first_of(design: Array, observed: Array, sigma: float, prior_sigmas: Array) 
     if not shown > 0.0:
         return None
     return Fit(complex(q[: len(observed), -1].conj() @ observed / r[-1, -1]), sigma / float(shown))
+
+
+def _may_be_late(lag: Lag, sensor: str) -> bool:
+    """Return whether the stamps of the fixes may be off; a sensor of whole poses has no such setting."""
+    return float(getattr(lag.problem.streams[sensor].config, "stamp_sigma_s", 0.0)) > 0.0
 
 
 def _mount_m(lag: Lag, receiver: str) -> Array:
