@@ -206,7 +206,8 @@ class VelocityLine(_Line):
     def measured(self, at: _At, config: VelocityConfig) -> Measurement | Rejection:
         """Return the velocity."""
         cov = _covariance(self.cov_enu_m2ps2, self.sigma_mps or _ZERO)
-        return _decoded(TWIST, _twist(self.v_enu_mps, cov), at, config)
+        as_named = config.model_copy(update={"convention": "enu"})  # the configured one is that of a bag
+        return _decoded(TWIST, _twist(self.v_enu_mps, cov), at, as_named)
 
 
 class BodyVelocityLine(_Line):

@@ -16,6 +16,9 @@ from graphloc.signals.series import interpolated
 from graphloc.time import seconds_since
 
 _MOST_APART_S = 1.0  # most time between two poses with which the trajectory between them counts as known
+# Of few states a second each may lie 0.4 periods off its place, on a measurement close by, so that up to 1.8 periods lie between two:
+# at most so many times what three quarters do not exceed. The most, as configurations have more than one state in 2 s.
+_TIMES, _SLOWEST_S = 2.5, 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,12 +73,13 @@ class Trajectory:
         )
 
     def covers(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return (M,) whether each stamp lies inside the span and between poses at most a second apart."""
+        """Return (M,) whether each stamp lies inside the span and between poses at most a second apart, or some periods of slower ones."""
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         right = np.clip(np.searchsorted(self.stamps_ns, stamps, side="left"), 1, len(self) - 1)
         gap = (self.stamps_ns[right] - self.stamps_ns[right - 1]) / 1e9
         inside = (stamps >= self.stamps_ns[0]) & (stamps <= self.stamps_ns[-1])
-        return np.asarray(inside & (gap <= _MOST_APART_S))
+        usual_s = float(np.quantile(np.diff(self.stamps_ns), 0.75)) / 1e9 if len(self) > 1 else 0.0
+        return np.asarray(inside & (gap <= np.clip(_TIMES * usual_s, _MOST_APART_S, _SLOWEST_S)))
 
     def _around(self, stamps: NDArray[np.int64]) -> slice:
         """Return the poses that interpolation at these stamps needs."""

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc import app
 from graphloc.blocks import MountConfig
-from graphloc.config import VelocityConfig, VesselConfig
+from graphloc.config import TimelineConfig, VelocityConfig, VesselConfig
 from graphloc.errors import ConfigError
 from graphloc.eval import ekf, metrics
 from graphloc.eval.holdout import HoldOut, suggested
@@ -24,6 +25,7 @@ from graphloc.measurements import BodyVelocity, GnssPosition, GnssVelocity, Pose
 from graphloc.recording import SpeedSeries
 from graphloc.solution import SlowEstimate
 from graphloc.time import stamps_of
+from graphloc.timeline import make_timeline
 from graphloc.trajectory import Trajectory
 
 
@@ -106,6 +108,23 @@ def test_metrics_agree_with_evo_and_by_hand() -> None:
 def test_half_a_track_is_half_matched() -> None:
     estimate, truth = _pair()
     assert metrics.compare_to_truth(estimate.where(slice(100)), truth).matched == 0.5
+
+
+@pytest.mark.parametrize("rate_hz", [0.6, 0.9, 1.2, 10.0])
+def test_a_track_covers_all_between_its_states_however_few_and_no_hole(rate_hz: float) -> None:
+    """At 0.9 states a second it covered nothing: truth, scans and held-out fixes lay outside of it."""
+    begin, end = 10**18, 10**18 + 120 * 10**9
+    fixes: Any = [SimpleNamespace(stamp_ns=begin + int(t * 1e9), sensor="gnss") for t in np.arange(0.3, 120.0, 0.77)]
+    stamps = make_timeline(begin, end, fixes, TimelineConfig(rate_hz=rate_hz)).stamps_ns
+    at = begin + (np.arange(4.0, 116.0, 0.1) * 1e9).astype(np.int64)
+    for kept in (stamps > 0, (stamps < begin + 50 * 10**9) | (stamps > begin + 60 * 10**9)):
+        some = stamps[kept]
+        track = Trajectory(
+            stamps_ns=some, p_world_m=np.zeros((len(some), 3)), R_world_body=np.tile(np.eye(3), (len(some), 1, 1))
+        )
+        before, after = some[some < begin + 50 * 10**9][-1], some[some > begin + 50 * 10**9][0]
+        known = (at <= before) | (at >= after) | (after - before < 5 * 10**9)
+        np.testing.assert_array_equal(track.covers(at), known)
 
 
 @pytest.mark.parametrize("text", ["every:1", "gaps:0x10", "gaps:3", "each:2", "gaps:2x0"])

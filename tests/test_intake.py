@@ -12,7 +12,7 @@ GRAVITY = np.array([0.0, 0.0, 9.81])
 
 def sample(at_ms: float, seq: int = 0, reading: float = 0.0) -> ImuSample:
     """A sample at rest; `reading`: what tells it from others."""
-    force_mps2 = GRAVITY + [1e-6 * reading, 0.0, 0.0]
+    force_mps2 = GRAVITY + np.array([1e-6 * reading, 0.0, 0.0])
     return ImuSample(
         stamp_ns=round(at_ms * MS), sensor="imu", seq=seq, accel_mps2=force_mps2, gyro_radps=np.zeros(3)
     )  # fmt: skip

@@ -165,12 +165,15 @@ def test_restarts_after_a_long_imu_silence() -> None:
 
 
 def test_a_start_that_fails_keeps_the_ledger_complete(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lag cannot be built: what came for it has its rows, and the next start is taken."""
-    base, online = arrivals_of(run_of()), smoother(run_of())
+    """The lag cannot be built: what came for it has its rows, and the next start is taken, with the heading that is configured."""
+    heading_deg = float(90.0 - np.degrees(run_of().truth.yaw_rad[0]))
+    base, config = arrivals_of(run_of()), run_of().config.with_start_heading(heading_deg)
+    online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL)
     base = base[: at_s(base, 13.0)]
-    failures = [RuntimeError("planted")]
+    failures, known = [RuntimeError("planted")], list[float | None]()
 
     def fails_once(*arguments: Any, **named: Any) -> Any:
+        known.append(online._setup.config.start.heading_deg)  # noqa: SLF001
         if failures:
             raise failures.pop()
         return live_problem(*arguments, **named)
@@ -180,6 +183,7 @@ def test_a_start_that_fails_keeps_the_ledger_complete(monkeypatch: pytest.Monkey
     assert complaints(base, fed) == []
     assert [e for e in fed.events if e == "the start failed (RuntimeError: planted): restarts"]
     assert [e for e in fed.events if e.startswith("started")]
+    assert known[:2] == [heading_deg, heading_deg]
 
 
 @pytest.mark.parametrize("kept", [True, False])

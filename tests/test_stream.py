@@ -142,6 +142,8 @@ def test_velocity() -> None:
     level = said({**VELOCITY, "v_enu_mps": [1, 2, 0], "sigma_mps": [0.1, 0.2, 0.3]}).cov_m2ps2  # as in a bag: not told
     np.testing.assert_allclose(level[:2, :2], np.diag([0.01, 0.04]))
     assert level[2, 2] > 1e4
+    down = parse_config({"sensors": {"v": {"kind": "gnss_velocity", "convention": "ned"}}}, KINDS, "test")  # of a bag
+    np.testing.assert_array_equal(said(VELOCITY, down).v_enu_mps, [1, 2, -0.5])
 
 
 def test_pose_with_modes() -> None:

@@ -56,12 +56,13 @@ def propagate(problem: LiveProblem, newest: Newest, odometry: Odometry, stamp_ns
     p_odom, R_odom = odometry.after(*_body_step(problem, pose, there.pose()))
     dt_s, noise = (stamp_ns - newest.stamp_ns) * 1e-9, pim.preintMeasCov()
     pose_cov = propagated_covariance(newest.pose_cov, newest, there.pose().rotation().matrix(), dt_s, noise)
+    R = pose.rotation().matrix()  # the noise is in the body's axes at the newest state
     return Propagated(
         stamp_ns=stamp_ns,
         pose=there.pose(),
         velocity=np.asarray(there.velocity()),
         pose_cov=pose_cov,
-        velocity_cov=newest.velocity_cov + noise[6:, 6:],
+        velocity_cov=newest.velocity_cov + R @ noise[6:, 6:] @ R.T,
         p_odom_m=p_odom,
         R_odom_body=R_odom,
     )

@@ -399,8 +399,7 @@ class OnlineSmoother:
 
     def _take_over(self, started: Started, samples: list[ImuSample], others: list[Measurement], until_ns: int) -> None:
         """Build the window at the start's state, and bring it up to the newest sample."""
-        persistent = self._persistent
-        self._setup = self._setup.without_start_heading()
+        persistent, setup = self._persistent, self._setup.without_start_heading()
         persistent.datum, persistent.heights_m = started.datum, started.heights_m
         persistent.heading = started.heading
         persistent.noise.at_least(started.noise_scale, started.gyro_noise, started.accel_noise, *started.bias_walk)
@@ -410,11 +409,12 @@ class OnlineSmoother:
             self._ledger.used(sample)
         self._waiting.taken()
         solved = (started.pose, started.velocity, started.bias)
-        tracking = Tracking(self._setup, persistent, self._ledger, started.anchor, samples, solved)
+        tracking = Tracking(setup, persistent, self._ledger, started.anchor, samples, solved)
         persistent.unmodelled = tracking.lag.unmodelled(started.before)
         self._tracking = tracking  # last of what can fail, as it has to hold the measurements then
         self._ledger.enter(started.rows)
         tracking.catch_up(started.anchor, samples, others, until_ns)
+        self._setup = setup  # a start that fails needs the heading again
         self._keep_anchor(tracking)
         newest_ns = tracking.lag.newest.stamp_ns
         persistent.noise.begin(newest_ns)
