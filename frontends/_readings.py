@@ -28,16 +28,15 @@ from graphloc.frontends._turns import SCATTERED, scattered
 from graphloc.frontends.decode import Decoded, ImuReading
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import (
-    BodyVelocity,
     CompassHeading,
     GnssPosition,
-    GnssVelocity,
     ImuSeries,
     Measurement,
     PoseFix,
 )
 from graphloc.signals.frozen_imu import FROZEN_IMU, frozen_imu_warning, frozen_samples
 from graphloc.signals.imu_spikes import IMU_SPIKE, spike_warning, spikes
+from graphloc.signals.repeats import REPEATED, Repeats
 from graphloc.signals.thinning import THINNED, Thinning
 from graphloc.time import NS_PER_S, utc_text
 
@@ -256,13 +255,9 @@ def _drop_wrong(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
 
 def reject_repeats(readings: Readings) -> list[LedgerRow]:
     """Drop messages that repeat the value and the stamp of an earlier one: they are no new evidence."""
-    seen: set[tuple[int, object]] = set()
-    bad = np.zeros(len(readings.values), dtype=bool)
-    for i, (stamp_ns, value) in enumerate(zip(readings.stamps_ns, readings.values, strict=True)):
-        key = (stamp_ns, _content(value))
-        bad[i] = key in seen
-        seen.add(key)
-    return readings.drop(bad, rejected("repeated message: same stamp, same value"))
+    repeats = Repeats()
+    bad = [repeats.repeats(*pair) for pair in zip(readings.stamps_ns, readings.values, strict=True)]
+    return readings.drop(np.array(bad, dtype=bool), rejected(REPEATED))
 
 
 def judge_fixes(readings: Readings, warnings: list[str]) -> list[LedgerRow]:
@@ -303,23 +298,6 @@ def reject_scattered(imu: ImuSeries | None, readings: Readings, warnings: list[s
         return []
     bad = scattered(imu, readings.of(CompassHeading))
     return _drop(readings, bad, rejected(SCATTERED), warnings)
-
-
-def _content(value: Decoded) -> object:
-    """Return the content of a measurement as a hashable value."""
-    match value:
-        case GnssPosition():
-            return value.position
-        case CompassHeading():
-            return value.yaw_rad
-        case GnssVelocity():
-            return tuple(value.v_enu_mps)
-        case BodyVelocity():
-            return tuple(value.value)
-        case PoseFix():
-            return tuple(value.modes[0].value)
-        case _:
-            return id(value)
 
 
 def reject_stored(readings: Readings, warnings: list[str]) -> list[LedgerRow]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Callable
@@ -162,6 +163,27 @@ def test_restarts_after_a_long_imu_silence() -> None:
     n = int(np.argmax(np.diff(stamps)))
     step = np.linalg.norm(fed.estimates[n + 1].p_odom_m - fed.estimates[n].p_odom_m)
     assert step < 6.0 * (np.linalg.norm(fed.estimates[n].v_world_mps) + 1.0)
+
+
+def test_what_comes_twice_counts_once() -> None:
+    """A bridge that sends again, at once or a second later: four fixes of a stamp had made bounds half as wide."""
+    base = arrivals_of(run_of())
+    base = base[: at_s(base, 14.0)]
+    rows = itertools.count(10**6)
+    often = []
+    for k, arrival in enumerate(base):
+        often.append(arrival)
+        if not isinstance(arrival.m, ImuSample):
+            often.append(Arrival(arrival.true_ns, replace(arrival.m, seq=next(rows))))
+        if k >= 50 and not isinstance(base[k - 50].m, ImuSample):
+            often.append(Arrival(arrival.true_ns, replace(base[k - 50].m, seq=next(rows))))
+    online = smoother(run_of())
+    fed = finish(online, feed(online, run_of(), often))
+    for a, b in zip(fed.estimates, undisturbed().estimates, strict=True):
+        np.testing.assert_array_equal(a.cov, b.cov)
+    repeated = [row for row in fed.rows if row.seq >= 10**6]
+    assert len(repeated) == next(rows) - 10**6
+    assert all(row.outcome is Outcome.REJECTED and row.reason.startswith("repeated message") for row in repeated)
 
 
 def test_a_start_that_fails_keeps_the_ledger_complete(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,6 +38,7 @@ from graphloc.origin import refuse_world_without_datum
 from graphloc.recording import Mounts
 from graphloc.signals.frozen_imu import FROZEN_IMU
 from graphloc.signals.imu_spikes import IMU_SPIKE
+from graphloc.signals.repeats import REPEATED, Repeats
 from graphloc.signals.thinning import THINNED, Thinning
 from graphloc.time import duration_ns, utc_text
 from graphloc.trajectory import Trajectory
@@ -90,6 +91,7 @@ class OnlineSmoother:
         self._ledger = OnlineLedger(config)
         self._ignored: set[str] = set()  # names of sensors, said once
         self._events: list[Event] = []
+        self._repeats = {n: Repeats() for n in setup.measuring}
         self._thinnings = {n: Thinning(apart_ns) for n, apart_ns in setup.apart_ns.items()}
         self._intake = ImuIntake(setup.gap_s, imu is not None and imu.gravity != "removed")
         self._snapshot = SnapshotFile(snapshot)
@@ -186,6 +188,9 @@ class OnlineSmoother:
             return self._feed_imu(m)
         if m.sensor not in self._setup.measuring:
             self._ignore(m, _NOT_ASKED)
+            return None
+        if self._repeats[m.sensor].repeats(m.stamp_ns, m):
+            self._ledger.drop(m, Outcome.REJECTED, REPEATED)
             return None
         newest = self._intake.newest
         if newest is None:
