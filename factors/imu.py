@@ -36,19 +36,19 @@ from numpy.typing import NDArray
 from graphloc import keys
 from graphloc.config import ImuConfig
 from graphloc.frames import Array
-from graphloc.inertial import GapMotion
+from graphloc.inertial import GAP_TOLD_S, GAP_TURN_RADPS, GapMotion
 from graphloc.measurements import ImuSeries
 from graphloc.signals.series import integral, interpolated
 from graphloc.time import duration_ns
 
-_UNKNOWN_MPS2, _UNKNOWN_RADPS = 1.0, 0.2  # white noise of unknown motion in a gap
+_UNKNOWN_MPS2 = 1.0  # white noise of unknown motion in a gap
 _SHORT_S = 2.0  # longest gap that is interpolated linearly; none is so short in which an IMU is switched off and on
 # Silences are kept for so long after the samples about them: it is asked how far a bias has gone since then (`judge.bias_walk`, by a
 # quarter of an hour).
 _SILENT_KEPT_S = 1000.0
 _STALLS_S = 10.0  # longest pause of all sensors that is taken for a recorder's and not for a power cycle; a choice
 _ANEW = 0.25  # of the turn-on bias, by which it differs from one time to the next; a choice
-_FORGET_S, _AROUND_S = 1.0, 10.0  # decay of the last sample in a gap; length of the means on either side
+_FORGET_S = 1.0  # decay of the last sample in a gap
 _LAID_MPS = 3.0  # 1 sigma, of a vessel whose velocity is not known yet
 _ASKEW_RAD = 0.1  # 1 sigma, of the direction of a motion across a pause
 _GAP_STEP_S = 0.1  # integration step across a gap
@@ -116,7 +116,7 @@ class Links:
         """Drop the samples before a stamp, except the last of them and those that the bridge of a gap after it needs."""
         self._left_out = [gap for gap in self._left_out if gap[1] >= before_ns]
         self._silent = self._silent[self._silent[:, 1] >= before_ns - duration_ns(_SILENT_KEPT_S)]
-        before_ns = min([before_ns, *(a - duration_ns(_AROUND_S) for a, _ in self._left_out)])
+        before_ns = min([before_ns, *(a - duration_ns(GAP_TOLD_S) for a, _ in self._left_out)])
         first = max(int(np.searchsorted(self._stamps, before_ns)) - 1, 0)
         self._stamps, self._samples = self._stamps[first:].copy(), self._samples[first:].copy()
 
@@ -150,7 +150,7 @@ class Links:
         middles = (edges[:-1] + edges[1:]) // 2
         samples, params = self._at(middles), self._params
         if gap is not None and gap[1] - gap[0] <= _SHORT_S * 1e9 and gap[1] <= self._stamps[-1]:
-            params = self._make_params(self._gravity_mps2, _UNKNOWN_MPS2, np.full(3, _UNKNOWN_RADPS))
+            params = self._make_params(self._gravity_mps2, _UNKNOWN_MPS2, np.full(3, GAP_TURN_RADPS))
         elif gap is not None:
             going = going or GapMotion(bias, np.zeros(3))
             samples, bias = self._bridge(middles, samples, gap, going), going.bias
@@ -233,8 +233,8 @@ class Links:
         else:
             share = (end - begin) * _FORGET_S * 1e9 / (gap[1] - gap[0])
         white = self._config.gyro_noise_radps * self._noise_scale
-        tilt = np.hypot(white, _UNKNOWN_RADPS * np.sqrt(share / ((stop_ns - start_ns) * 1e-9)))
-        return self._make_params(0.0, _UNKNOWN_MPS2, np.array([tilt, tilt, _UNKNOWN_RADPS]))
+        tilt = np.hypot(white, GAP_TURN_RADPS * np.sqrt(share / ((stop_ns - start_ns) * 1e-9)))
+        return self._make_params(0.0, _UNKNOWN_MPS2, np.array([tilt, tilt, GAP_TURN_RADPS]))
 
     def _paused(self, params: Any, pause: tuple[int, int], share: float, going: GapMotion | None) -> Any:
         """Return the parameters of an interval, a share of which lies in a pause, in which perhaps no time passed and nothing moved.
@@ -257,7 +257,7 @@ class Links:
 
     def _means_around(self, start_ns: int, stop_ns: int) -> tuple[Array, Array]:
         """Return the means (6,) of the seconds before and after a gap; a side with too few samples takes the mean of the other."""
-        around_ns = duration_ns(_AROUND_S)
+        around_ns = duration_ns(GAP_TOLD_S)
         first, start, stop, last = np.searchsorted(
             self._stamps, [start_ns - around_ns, start_ns + 1, stop_ns, stop_ns + around_ns]
         )
@@ -286,7 +286,7 @@ class Links:
         """Return the variances (M,), each axis, rad^2/s^2, of `gyro_at`: white noise of one sample; of unknown motion where there is none."""
         steps = np.diff(self._stamps)
         steps = steps[steps <= self._max_gap_ns]
-        variance = np.full(len(stamps_ns), _UNKNOWN_RADPS**2 / _FORGET_S)
+        variance = np.full(len(stamps_ns), GAP_TURN_RADPS**2 / _FORGET_S)
         if len(steps):
             sampled = np.ones(len(stamps_ns), dtype=bool)
             for after_ns, until_ns in self.gaps():

@@ -38,6 +38,12 @@ class InertialRow(Protocol):
         ...
 
 
+GAP_TOLD_S = 10.0
+"""Length of the samples on either side of a gap that tell the motion in it."""
+GAP_TURN_RADPS = 0.2
+"""White noise of the unknown turning in a gap, rad/s per sqrt(s)."""
+
+
 class GapMotion(NamedTuple):
     """What is taken to go on in a gap of the IMU's data, from the state before it.
 

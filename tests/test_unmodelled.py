@@ -13,6 +13,7 @@ from graphloc.config import GnssConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, Geodetic, wrap_angle
+from graphloc.judge.covariances import Unmodelled
 from graphloc.measurements import GnssPosition, Measurement
 from graphloc.online import OnlineSmoother, _waiting
 from graphloc.online._unmodelled import UnmodelledError
@@ -21,7 +22,7 @@ from graphloc.signals.series import rms
 from graphloc.solution import Solution
 from graphloc.solve import _solution
 from graphloc.solve.batch import BatchResult
-from graphloc.solve.unmodelled import Unmodelled, unmodelled
+from graphloc.solve.unmodelled import unmodelled
 from graphloc.time import NS_PER_S
 from graphloc.trajectory import Trajectory
 from tests.faults import arrivals_of, feed, finish

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -61,6 +61,17 @@ def widen_heading(cov: Array, heading_var: Array | float) -> None:
     for arm, share in zip((across, along), shares, strict=True):  # means of sin^2 and (1 - cos)^2
         cov[..., :2, :2] += share[..., None, None] * arm[..., :, None] * arm[..., None, :]
     cov[..., 5, 5] += more
+
+
+class Unmodelled(NamedTuple):
+    """Covariances to add, (N, 3, 3) each, in world axes.
+
+    Attributes:
+        rotation: rad^2. velocity: m^2/s^2.
+    """
+
+    rotation: Array
+    velocity: Array
 
 
 def untold_errors(streams: Sequence[Any]) -> dict[str, SlowProcess]:

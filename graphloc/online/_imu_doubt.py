@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.solve.wrong_imu import GROWS
+from graphloc.inertial import GAP_TOLD_S, GAP_TURN_RADPS
+from graphloc.judge.wrong_imu import GROWS
 from graphloc.time import duration_ns
 
 # Fewest sensors that deny; fewest measurements in a row of each that do, and of one sensor at least.
@@ -34,9 +35,8 @@ _AT_ONCE_S = 2.5  # longest time since the first denial: later on, a gap explain
 _BEFORE_S = 0.3  # the wrong samples begin so long before the first denial
 _AGAIN_S = 1.0  # time before the next trial, after one that explained nothing
 _HOLD_S = (0.5, 4.0)  # for how long samples are left out: at first, and at most
-_TOLD_S = 10.0  # span before a gap whose samples tell the motion in it, as in `factors.imu`
 _QUIET_S = 10.0  # time after the last gap, without another, after which the IMU counts as right again
-_TURNED_RADPS = 0.6  # rad/s per sqrt(s): 3 sigmas of the turn in a gap (`factors.imu`)
+_TURNED = 3.0  # sigmas of the turn in a gap
 
 
 class Denials:
@@ -150,7 +150,7 @@ class ImuDoubt:
 
     def told_by(self, first_ns: int) -> list[tuple[int, int]]:
         """Return the spans before the gaps that reach beyond a stamp: their samples tell the motion within the gaps."""
-        return [(a - duration_ns(_TOLD_S), a) for a, b in self.gaps if b >= first_ns]
+        return [(a - duration_ns(GAP_TOLD_S), a) for a, b in self.gaps if b >= first_ns]
 
     def _over_ns(self) -> int:
         return self.gaps[-1][1] if self.gaps else 0
@@ -167,4 +167,4 @@ def turns_otherwise(stamps_ns: NDArray[np.int64], rates_radps: Array, R: Array) 
     for rate, dt_s in zip(rates_radps, np.diff(stamps_ns) * 1e-9, strict=False):
         told = told.compose(gtsam.Rot3.Expmap(rate * dt_s))
     off_rad = float(np.linalg.norm(gtsam.Rot3.Logmap(told.inverse().compose(gtsam.Rot3(R)))))
-    return off_rad > float(_TURNED_RADPS * np.sqrt((stamps_ns[-1] - stamps_ns[0]) * 1e-9))
+    return off_rad > float(_TURNED * GAP_TURN_RADPS * np.sqrt((stamps_ns[-1] - stamps_ns[0]) * 1e-9))

@@ -21,6 +21,7 @@ from graphloc.judge.decide import AGREES
 from graphloc.judge.health import why_late, why_unlikely
 from graphloc.judge.imu_noise import log_likelihood
 from graphloc.judge.warnings import noisier_warning
+from graphloc.judge.wrong_imu import most_motion
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
@@ -33,7 +34,6 @@ from graphloc.online._states import Newest, States
 from graphloc.online._unmodelled import BeforeStart, ErrorSizes, UnmodelledError, estimated_beside
 from graphloc.online._window import Window
 from graphloc.signals.position_jumps import why_in_doubt
-from graphloc.solve.wrong_imu import most_motion
 
 # Median over IMU steps of a sum of 9 weighted squares: below 0.2 where the IMU agrees, 1 to 10 where its noise is 3
 # times too small.

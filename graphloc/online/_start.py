@@ -20,7 +20,7 @@ from graphloc import keys, origin
 from graphloc.build import Made, Problem, build_graph, company_of, make_problem
 from graphloc.errors import GraphlocError, SolveError
 from graphloc.frames import Array, Datum
-from graphloc.judge.covariances import ANY_HEADING_RAD, world_covariance
+from graphloc.judge.covariances import ANY_HEADING_RAD, Unmodelled, world_covariance
 from graphloc.judge.decide import AGREES, decisions
 from graphloc.judge.imu_noise import LARGEST_NOISE_SCALE
 from graphloc.judge.ledger import row_of
@@ -35,7 +35,7 @@ from graphloc.solve.alignment import wanted_travel_m
 from graphloc.solve.batch import BatchResult, solve_batch
 from graphloc.solve.imu_mount import followed_before
 from graphloc.solve.stretch import StretchStep, past_at
-from graphloc.solve.unmodelled import Unmodelled, unmodelled
+from graphloc.solve.unmodelled import unmodelled
 from graphloc.solve.warnings import noise_warnings
 from graphloc.time import duration_ns
 

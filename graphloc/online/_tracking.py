@@ -16,6 +16,7 @@ import numpy as np
 from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate, Event
 from graphloc.frames import Array, yaw_from_rotation
+from graphloc.judge.wrong_imu import WRONG_IMU
 from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample, ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
@@ -34,7 +35,6 @@ from graphloc.online._receiver_checks import FROZEN_ONLINE
 from graphloc.online._recent import Recent
 from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
-from graphloc.solve.wrong_imu import WRONG_IMU
 from graphloc.time import duration_ns, stamps_of, utc_text
 from graphloc.trajectory import Trajectory
 

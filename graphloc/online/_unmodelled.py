@@ -38,12 +38,11 @@ from graphloc import keys
 from graphloc.frames import Array, skew
 from graphloc.graph import SlowProcess
 from graphloc.inertial import GapMotion, InertialLink
-from graphloc.judge.covariances import untold_errors
+from graphloc.judge.covariances import Unmodelled, untold_errors
 from graphloc.motion_model import MotionModel
 from graphloc.online._anchor import in_world, sound
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import Newest, hole_within
-from graphloc.solve.unmodelled import Unmodelled
 from graphloc.time import NS_PER_S
 
 _ROTATION, _POSITION, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)

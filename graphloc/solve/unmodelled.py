@@ -11,31 +11,18 @@ Its covariance is that of a consider parameter (Schmidt 1966), with d drawn from
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from graphloc import keys
 from graphloc.build import Stream
 from graphloc.frames import Array
 from graphloc.graph import SlowProcess
-from graphloc.judge.covariances import untold_errors
+from graphloc.judge.covariances import Unmodelled, untold_errors
 from graphloc.judge.linearised import linearised, normal_solver
 from graphloc.solve.batch import BatchResult
 from graphloc.time import NS_PER_S
 
 _DRAWS, _AT_ONCE = 64, 16  # a sigma from 64 draws is good to 9 %; so many at once, for memory
-
-
-class Unmodelled(NamedTuple):
-    """Covariances to add, (N, 3, 3) each, in world axes.
-
-    Attributes:
-        rotation: rad^2. velocity: m^2/s^2.
-    """
-
-    rotation: Array
-    velocity: Array
 
 
 def unmodelled(result: BatchResult) -> Unmodelled | None:

@@ -21,23 +21,21 @@ from graphloc.build import Past, Problem, StartPrior, without_imu
 from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.judge.decide import agrees, met
+from graphloc.judge.wrong_imu import GROWS, WRONG_IMU, most_motion
 from graphloc.ledger import Outcome
 from graphloc.recording import Recording
 from graphloc.solve._passes import cost_as_configured
 from graphloc.solve.stretch import copy_states, dead_reckon
 from graphloc.time import NS_PER_S, duration_ns, utc_text
 
-WRONG_IMU = "contradicts the other sensors, which agree with each other"
 # Square of an IMU factor, in sigmas, from which it is a contradiction; and how many times the usual one it must be.
 _SUSPECT, _TIMES = 36.0, 30.0
 _BEFORE_S = 2.5  # length of the end of what is known before a window that may be wrong already
 # Log-likelihood: price of each IMU factor that is left out, and least gain of leaving out any.
 _PRICE, _CLEARLY = 1.0, 30.0
 _WORSE = 6.0  # log-likelihood by which a shorter span may be less probable
-GROWS = 4.0  # a residual grows if its square reaches so many times that of the first in a row
 _IN_A_ROW = 3  # measurements in a row that disagree make their sensor one that denies
 _SENSORS, _FEWEST = 2, 2  # sensors that must agree without the IMU, each with so many more measurements
-_MOTION = 3.0  # sigmas of the motion in a gap, at once and for each second
 
 
 class ImuWrong(Exception):
@@ -63,14 +61,6 @@ def left_out(recording: Recording, spans: Sequence[tuple[int, int]]) -> tuple[Re
     rows = (*recording.rows, *recording.imu_rows(wrong, Outcome.REJECTED, WRONG_IMU))
     said = f"{imu.sensor}: for {where} it {WRONG_IMU}: {int(wrong.sum())} samples rejected, the motion there is bridged as in an IMU gap"
     return replace(recording, imu=imu.where(~wrong), rows=rows), said
-
-
-def most_motion(length_s: float) -> float:
-    """Return the squared motion that a vessel may make in a gap of the IMU of some length (s).
-
-    It is in sigmas of what is expected there (`factors.imu`).
-    """
-    return _MOTION**2 * (1.0 + length_s)
 
 
 class GrownWindow(NamedTuple):
