@@ -20,6 +20,7 @@ from graphloc.measurements import CompassHeading, GnssPosition, Measurement, Pos
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 from graphloc.solve._legs import _own, overlap_ns, seams, solve_legs
+from graphloc.solve._parts import mean_of
 from tests.slowly import sparsely
 
 S = 10**9
@@ -233,3 +234,11 @@ def test_a_figure_that_each_leg_finds_anew_is_said_once(monkeypatch: pytest.Monk
     assert len(set(lines)) == 2  # or there is nothing to join
     (said,) = (w for w in found.stats.warnings if "configured too small" in w)
     assert said == f"{max(lines, key=times)} (the worst of 2 parts of the run that show this)"
+
+
+def test_what_parts_estimate_of_a_sensor_counts_by_their_length() -> None:
+    """5 s after a gap had counted as half an hour before it."""
+    half_an_hour = {"gnss": np.array([0.4, 0.0, 1.0]), "log": 0.2}
+    found = mean_of([half_an_hour, {"gnss": np.array([0.0, 0.0, 0.0])}], [900, 100])
+    np.testing.assert_allclose(found["gnss"], [0.36, 0.0, 0.9])
+    assert float(found["log"]) == pytest.approx(0.2)

@@ -119,6 +119,7 @@ def _join(solutions: Sequence[Solution], rows: Sequence[LedgerRow], warnings: Se
     """
     tracks = [s.trajectory for s in solutions]
     offsets = [s.offsets for s in solutions if s.offsets is not None]
+    states = [len(track) for track in tracks]
     return Solution(
         datum=solutions[0].datum,
         trajectory=Trajectory(**_columns(tracks, "stamps_ns", "p_world_m", "R_world_body", "v_world_mps", "cov")),
@@ -131,8 +132,8 @@ def _join(solutions: Sequence[Solution], rows: Sequence[LedgerRow], warnings: Se
         ledger=Ledger([*rows, *(row for s in solutions for row in s.ledger)]),
         stats=_join_stats([s.stats for s in solutions], warnings),
         offsets=joined(offsets) if offsets else None,
-        time_offsets_s={name: float(by) for name, by in _mean([s.time_offsets_s for s in solutions]).items()},
-        antennas_off_m=_mean([s.antennas_off_m for s in solutions]),
+        time_offsets_s={name: float(by) for name, by in mean_of([s.time_offsets_s for s in solutions], states).items()},
+        antennas_off_m=mean_of([s.antennas_off_m for s in solutions], states),
     )
 
 
@@ -152,9 +153,10 @@ def _by_name(parts: Iterable[Mapping[str, _T]]) -> dict[str, list[_T]]:
     return found
 
 
-def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[np.float64]]:
-    """Return, by name, the mean over the parts of a run that have it."""
-    return {name: np.mean(own, axis=0) for name, own in _by_name(parts).items()}
+def mean_of(parts: Sequence[Mapping[str, Any]], states: Sequence[int]) -> dict[str, NDArray[np.float64]]:
+    """Return, by name, the mean over the parts of a run that have it, each as much as it has states."""
+    weighed = _by_name([{name: (own, n) for name, own in part.items()} for part, n in zip(parts, states, strict=True)])
+    return {name: np.average([x for x, _ in own], axis=0, weights=[n for _, n in own]) for name, own in weighed.items()}
 
 
 def _since_agreed(solutions: Sequence[Solution]) -> dict[str, NDArray[np.float64]]:
