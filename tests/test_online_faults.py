@@ -164,6 +164,46 @@ def test_restarts_after_a_long_imu_silence() -> None:
     assert step < 6.0 * (np.linalg.norm(fed.estimates[n].v_world_mps) + 1.0)
 
 
+def test_a_dead_imu_is_said_once_a_silence() -> None:
+    """The newest pose stays as it is, good or not, so nothing else would show it."""
+    online, _ = begun(10.0)
+    base = arrivals_of(run_of())
+    others = [a for a in base[at_s(base, 10.0) : at_s(base, 16.0)] if not isinstance(a.m, ImuSample)]
+    first_ns = {sensor: next(a.m.stamp_ns for a in others if a.m.sensor == sensor) for sensor in ("gnss", "compass")}
+    told = []
+    for a in others:
+        assert online.feed(a.m) is None
+        told += [(a.m, e) for e in online.events()]
+    ((m, event),) = told
+    gone_on_s = (m.stamp_ns - first_ns[m.sensor]) / 1e9
+    assert 3.0 <= gone_on_s < 3.5
+    assert event.warns
+    assert (
+        event.text
+        == f"imu: no sample has come while {m.sensor} went on for {gone_on_s:.1f} s: no new pose until one comes"
+    )
+
+    back = [a.m for a in base[at_s(base, 16.0) : at_s(base, 16.5)]]
+    again = [a.m for a in base[at_s(base, 16.5) : at_s(base, 20.5)] if not isinstance(a.m, ImuSample)]
+    for m in (*back, *again):
+        online.feed(m)
+    assert sum("no new pose until one comes" in e.text for e in online.events()) == 1
+
+
+def test_what_a_sensor_had_stored_tells_no_dead_imu() -> None:
+    """Six seconds of messages that come at once, after the IMU's samples; and a clock that is 18 s ahead."""
+    base = arrivals_of(run_of())
+    stored = base[at_s(base, 10.0) : at_s(base, 16.0)]
+    imu = [a.m for a in stored if isinstance(a.m, ImuSample)]
+    others = [a.m for a in stored if not isinstance(a.m, ImuSample)]
+    ahead = [replace(a.m, stamp_ns=a.m.stamp_ns + (0 if isinstance(a.m, ImuSample) else 18 * 10**9)) for a in stored]
+    for messages in ((*imu, *others), ahead):
+        online, _ = begun(10.0)
+        for m in messages:
+            online.feed(m)
+        assert not [e for e in online.events() if "no new pose" in e.text]
+
+
 def test_a_start_that_fails_keeps_the_ledger_complete(monkeypatch: pytest.MonkeyPatch) -> None:
     """The lag cannot be built: what came for it has its rows, and the next start is taken."""
     base, online = arrivals_of(run_of()), smoother(run_of())
