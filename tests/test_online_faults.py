@@ -164,6 +164,19 @@ def test_restarts_after_a_long_imu_silence() -> None:
     assert step < 6.0 * (np.linalg.norm(fed.estimates[n].v_world_mps) + 1.0)
 
 
+def test_rates_in_degrees_are_waited_out() -> None:
+    """To solve a start with them would take a minute, and leave nothing: it begins when the rates are right."""
+    base, online = arrivals_of(run_of()), smoother(run_of())
+    for a in base[: at_s(base, 7.0)]:
+        m = replace(a.m, gyro_radps=np.degrees(a.m.gyro_radps)) if isinstance(a.m, ImuSample) else a.m
+        assert online.feed(m) is None
+    assert re.fullmatch(
+        r"IMU data that a vessel can have: it rolls and pitches by \d+ deg within 5 s: rates in deg/s\?",
+        online.waiting_for,
+    )
+    assert online.events() == []
+
+
 def test_a_dead_imu_is_said_once_a_silence() -> None:
     """The newest pose stays as it is, good or not, so nothing else would show it."""
     online, _ = begun(10.0)
