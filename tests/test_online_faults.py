@@ -177,6 +177,17 @@ def test_rates_in_degrees_are_waited_out() -> None:
     assert online.events() == []
 
 
+def test_a_snapshot_without_a_name_does_not_keep_from_starting() -> None:
+    """As of `snapshot=""`, a setting that a program has not been given: the start failed, over and over."""
+    base, online = arrivals_of(run_of()), smoother(run_of(), snapshot=Path(""))
+    for a in base[: at_s(base, 7.0)]:
+        online.feed(a.m)
+    assert online.waiting_for == ""
+    texts = [e.text for e in online.events()]
+    assert sum("the snapshot cannot be written (ValueError" in text for text in texts) == 1
+    assert not [text for text in texts if "failed" in text]
+
+
 def test_a_dead_imu_is_said_once_a_silence() -> None:
     """The newest pose stays as it is, good or not, so nothing else would show it."""
     online, _ = begun(10.0)
