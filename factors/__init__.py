@@ -21,13 +21,16 @@ def _theirs() -> tuple[Sensor, ...]:
     """Return the rows of installed packages.
 
     Raises:
-        ConfigError: an entry is not a row, its kind differs from the name of the entry point, or its kind is taken.
+        ConfigError: an entry is not a row, its configuration is none, its kind differs from the name of the entry point, or its kind is taken.
     """
     taken = {INERTIAL.kind, *(row.kind for row in _OURS)}
     for name, row in added(GROUP).items():
-        if not isinstance(row, Sensor) or row.kind != name or name in taken:
+        is_row = isinstance(row, Sensor)
+        configured = is_row and isinstance(row.config, type) and issubclass(row.config, SensorConfig)
+        if not configured or row.kind != name or name in taken:
             why = (
-                f"is a {type(row).__name__}, no Sensor" if not isinstance(row, Sensor)
+                f"is a {type(row).__name__}, no Sensor" if not is_row
+                else "the configuration of its row is no SensorConfig" if not configured
                 else f"its row is of kind '{row.kind}'" if row.kind != name else "graphloc has that kind itself"
             )  # fmt: skip
             raise ConfigError(f"{GROUP}: '{name}': {why}: mend or uninstall the package that adds it")

@@ -25,8 +25,6 @@ from graphloc.frontends._sanity import (
     saturation_warning,
     size_at_ease,
     slow_warning,
-    turns_gravity,
-    without_gravity,
 )
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import Pose, StaticTree
@@ -35,6 +33,7 @@ from graphloc.frontends.turning import Turning, course_against_turning, left_of_
 from graphloc.measurements import ImuSeries
 from graphloc.signals.frozen_imu import frozen_imu_warning, frozen_samples
 from graphloc.signals.imu_spikes import spike_warning, spikes
+from graphloc.signals.rates_in_degrees import turns_gravity, without_gravity
 from graphloc.signals.series import integral, runs
 from graphloc.signals.white_noise import white_noise
 from graphloc.time import NS_PER_S

@@ -10,12 +10,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig, VesselConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum, Geodetic, continuous_longitudes
 from graphloc.measurements import GnssPosition, ImuSeries, PoseFix
+from graphloc.signals.rates_in_degrees import swing_of_degrees, turns_gravity, without_gravity
 from graphloc.time import NS_PER_S
 
 FAR_M = 100e3
@@ -26,16 +26,12 @@ HALF = "half an IMU, and both halves must come in one message (RealSense: unite_
 FAR_LEVER_M = 50.0
 """A sensor this far from the origin of body is on a ship, or its mount is not in metres."""
 _FEWEST = 100  # so many samples are not all 0 by chance
-_SWING_NS, _NO_SWING_RAD = 5_000_000_000, 1.5
-_STEP_S = 0.2  # longest step over which rates are integrated
-_GRAVITY_S, _FEWEST_WINDOWS = 0.4, 10  # duration and least number of windows whose mean acceleration tells where up is
 _LEAST_RANGE_MPS2, _LEAST_RANGE_RADPS = 19.0, 1.7  # no IMU has a smaller range (2 g, 100 deg/s)
 # Fewer readings at the end of the range may be chance; the band beneath the end (a share of it) must hold no more.
 _CUT, _BENEATH = 5, 0.03
 # Share of the samples that turn least; the craft is at ease if their rates are below this.
 _LEAST_TURNING, _AT_EASE_RADPS = 0.3, 0.3
 _LEAST_GRAVITY_MPS2, _MOST_GRAVITY_MPS2 = 8.5, 11.5  # a median acceleration between these may be gravity
-_EXPLAINED = 0.75  # largest share of the motion of gravity's direction that rates in rad/s leave unexplained
 
 
 def lever_warning(name: str, t_body_sensor_m: Array, tf_frame: str | None) -> list[str]:
@@ -72,35 +68,6 @@ def no_gravity_in_si(size: float, at_ease: bool) -> bool:
         size: in their unit. at_ease: whether the craft hardly turns, see `size_at_ease`.
     """
     return size < _LEAST_GRAVITY_MPS2 or (size > _MOST_GRAVITY_MPS2 and at_ease)
-
-
-def without_gravity(accel: Array) -> bool:
-    """Return whether accelerations (N, 3), m/s^2 or g, lack gravity: they are small, without a constant direction."""
-    size = float(np.median(np.linalg.norm(accel, axis=1)))
-    steady = float(np.linalg.norm(np.median(accel, axis=0)))
-    return size < 0.5 or (size < 2.0 and steady < 0.5 * size)
-
-
-def turns_gravity(stamps_ns: NDArray[np.int64], accel: Array, gyro_radps: Array) -> bool:
-    """Return whether rates (N, 3) turn the direction of accelerations (N, 3) as rad/s would; deg/s turn it by far more.
-
-    Gravity keeps its direction in world while the sensor turns. Accelerations also hold the thrust of a craft or a
-    hand, so half of the windows may not fit. Rates that are 57 times too large fit in no window. If they turn by more
-    than half a turn in a window, nothing is told.
-    """
-    t = (stamps_ns - stamps_ns[0]) / 1e9
-    begins = np.unique((t / _GRAVITY_S).astype(np.int64), return_index=True)[1]
-    if len(begins) < _FEWEST_WINDOWS:
-        return False
-    counts = np.diff(begins, append=len(t))[:, None]
-    mean = np.add.reduceat(accel, begins) / counts
-    up = mean / np.maximum(np.linalg.norm(mean, axis=1), 1e-9)[:, None]
-    steps_s = np.minimum(np.diff(t, prepend=t[0]), _STEP_S)
-    turned = np.diff(np.add.reduceat(np.cumsum(gyro_radps * steps_s[:, None], axis=0), begins) / counts, axis=0)
-    left = np.linalg.norm(up[1:] - Rotation.from_rotvec(-turned).apply(up[:-1]), axis=1)
-    moved = np.linalg.norm(np.diff(up, axis=0), axis=1)
-    round_and_round = float(np.median(np.linalg.norm(turned, axis=1))) > np.pi
-    return not round_and_round and float(np.median(left)) < _EXPLAINED * float(np.median(moved))
 
 
 def imu_warnings(sensor: str, accel_mps2: Array, gyro_radps: Array, config: ImuConfig) -> list[str]:
@@ -212,26 +179,14 @@ def refuse_accel_unit(sensor: str, accel_mps2: Array, config: ImuConfig) -> None
 def refuse_degrees(
     sensor: str, stamps_ns: NDArray[np.int64], accel_mps2: Array, gyro_radps: Array, config: ImuConfig
 ) -> None:
-    """Refuse rates (N, 3) in deg/s, with which the solver would run for many minutes.
-
-    The test is by how much they roll and pitch the vessel within 5 s: a small boat in chop has high rates, and a
-    vehicle may pivot fast, but none rolls by a quarter turn all the time. What does, as a camera in the hand, turns
-    gravity as its rates say.
+    """Refuse rates (N, 3) in deg/s, with which the solver would run for many minutes (see `swing_of_degrees`).
 
     Raises:
         InputError: they are.
     """
-    up = np.median(accel_mps2, axis=0) if len(accel_mps2) >= 10 else np.zeros(3)
-    size = float(np.linalg.norm(up))
-    if config.gyro_unit != "rad/s" or size < 0.5 or without_gravity(accel_mps2):
+    if config.gyro_unit != "rad/s":
         return
-    level = gyro_radps - np.outer(gyro_radps @ up, up) / size**2
-    steps_s = np.minimum(np.diff(stamps_ns, prepend=stamps_ns[0]) * 1e-9, _STEP_S)
-    angle = np.cumsum(level * steps_s[:, None], axis=0)
-    begins = np.unique((stamps_ns - stamps_ns[0]) // _SWING_NS, return_index=True)[1]
-    swings = np.maximum.reduceat(angle, begins) - np.minimum.reduceat(angle, begins)
-    swing = float(np.median(np.linalg.norm(swings, axis=1)))
-    if swing > _NO_SWING_RAD and not turns_gravity(stamps_ns, accel_mps2, gyro_radps):
+    if swing := swing_of_degrees(stamps_ns, accel_mps2, gyro_radps):
         raise InputError(
             f"{sensor}: it rolls and pitches by {np.degrees(swing):.0f} deg within 5 s (median of {config.topic}), which no vessel "
             f"does for long: angular_velocity looks like deg/s; set gyro_unit: deg/s of sensors.{sensor}"

@@ -51,6 +51,7 @@ from graphloc.frontends._sanity import fast_warning, lever_warning
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends._turns import Yaws, pose_turn_warning, refuse_unit, scale_warning, turn_warnings, wander_warning
 from graphloc.frontends.decode import (
+    DECODERS_GROUP,
     NMEA,
     ODOMETRY,
     TRUE_TYPES,
@@ -74,7 +75,7 @@ def check_bag(bags: Bags, config: VesselConfig) -> None:
     """Check that a bag can be opened and has the topics that the configuration names, without reading it.
 
     Raises:
-        InputError: no readable bag, a missing topic, or one of another type.
+        InputError: no readable bag, a missing topic, one of another type, or one of a kind that reads none.
     """
     with Bag(bags) as bag:
         _asked_for(config, bag)
@@ -246,10 +247,19 @@ def _asked_for(config: VesselConfig, bag: Bag) -> tuple[list[Readings], Referenc
 
 
 def _subscriptions(config: VesselConfig, topics: Mapping[str, TopicSummary], bag: str) -> list[Readings]:
-    """Return `Readings` for each enabled sensor that reads a topic."""
+    """Return `Readings` for each enabled sensor that reads a topic.
+
+    Raises:
+        InputError: see `check_bag`.
+    """
     found: list[Readings] = []
     for name, sensor in config.sensors.items():
         types = supported_types(sensor.kind)
+        if sensor.enabled and sensor.topic and not types:
+            raise InputError(
+                f"{bag}: sensors.{name}.topic '{sensor.topic}': nothing reads a topic for kind '{sensor.kind}': delete the key, or, if a "
+                f"package adds this kind, name its decoders '{sensor.kind}' under {DECODERS_GROUP}"
+            )
         if sensor.enabled and types:
             _check_topic(sensor.topic, f"sensors.{name}.topic", types, topics, bag)
             _check_through(name, sensor, found, topics[sensor.topic], bag)

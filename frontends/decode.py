@@ -7,7 +7,7 @@ has none; floors, scales and kernels belong to the factors.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from math import isfinite, pi
 from typing import Any, NamedTuple
@@ -27,6 +27,7 @@ from graphloc.config import (
     PoseConfig,
     VelocityConfig,
 )
+from graphloc.errors import ConfigError
 from graphloc.extras import added
 from graphloc.frames import Array, Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.frontends import nmea
@@ -618,14 +619,30 @@ DECODERS: dict[tuple[str, str], Decoder] = {
 }
 
 
-GROUP = "graphloc.decoders"  # group of entry points: each is named as a kind, and loads {message type: decoder}
+DECODERS_GROUP = (
+    "graphloc.decoders"  # group of entry points: each is named as a kind, and loads {message type: decoder}
+)
 
 
 def decoder_of(kind: str, msgtype: str) -> Decoder | None:
     """Return the decoder of a message type for a kind of sensor, ours or an entry point's; None if there is none."""
-    return DECODERS.get((kind, msgtype)) or added(GROUP).get(kind, {}).get(msgtype)
+    return DECODERS.get((kind, msgtype)) or _theirs(kind).get(msgtype)
 
 
 def supported_types(kind: str) -> tuple[str, ...]:
     """Return the message types that a kind of sensor is read from; empty if the kind reads no topic."""
-    return (*(msgtype for have, msgtype in DECODERS if have == kind), *added(GROUP).get(kind, {}))
+    return (*(msgtype for have, msgtype in DECODERS if have == kind), *_theirs(kind))
+
+
+def _theirs(kind: str) -> Mapping[str, Decoder]:
+    """Return what installed packages add to a kind.
+
+    Raises:
+        ConfigError: an entry is not a table of decoders.
+    """
+    table = added(DECODERS_GROUP).get(kind, {})
+    if not isinstance(table, Mapping):
+        raise ConfigError(
+            f"{DECODERS_GROUP}: '{kind}': is a {type(table).__name__}, no dict of message types and decoders: mend or uninstall the package that adds it"
+        )
+    return table

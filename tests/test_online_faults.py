@@ -186,6 +186,79 @@ def test_what_comes_twice_counts_once() -> None:
     assert all(row.outcome is Outcome.REJECTED and row.reason.startswith("repeated message") for row in repeated)
 
 
+def test_rates_in_degrees_are_waited_out() -> None:
+    """To solve a start with them would take a minute, and leave nothing: it begins when the rates are right."""
+    base, online = arrivals_of(run_of()), smoother(run_of())
+    for a in base[: at_s(base, 7.0)]:
+        m = replace(a.m, gyro_radps=np.degrees(a.m.gyro_radps)) if isinstance(a.m, ImuSample) else a.m
+        assert online.feed(m) is None
+    assert re.fullmatch(
+        r"IMU data that a vessel can have: it rolls and pitches by \d+ deg within 5 s: rates in deg/s\?",
+        online.waiting_for,
+    )
+    assert online.events() == []
+
+
+def test_a_snapshot_without_a_name_does_not_keep_from_starting() -> None:
+    """As of `snapshot=""`, a setting that a program has not been given: the start failed, over and over."""
+    base, online = arrivals_of(run_of()), smoother(run_of(), snapshot=Path(""))
+    for a in base[: at_s(base, 7.0)]:
+        online.feed(a.m)
+    assert online.waiting_for == ""
+    texts = [e.text for e in online.events()]
+    assert sum("the snapshot cannot be written (ValueError" in text for text in texts) == 1
+    assert not [text for text in texts if "failed" in text]
+
+
+def test_stamps_in_ms_are_said_to_be_of_another_clock() -> None:
+    """All fixes are then of 1970: none is used, and the ledger's reasons do not tell why."""
+    base, online = arrivals_of(run_of()), smoother(run_of())
+    for a in base[: at_s(base, 7.0)]:
+        online.feed(replace(a.m, stamp_ns=a.m.stamp_ns // 10**6) if isinstance(a.m, GnssPosition) else a.m)
+    said = [e for e in online.events() if "behind the IMU's: of another clock?" in e.text]
+    assert [(e.text.split(":")[0], e.warns) for e in said] == [("gnss", True)]
+
+
+def test_a_dead_imu_is_said_once_a_silence() -> None:
+    """The newest pose stays as it is, good or not, so nothing else would show it."""
+    online, _ = begun(10.0)
+    base = arrivals_of(run_of())
+    others = [a for a in base[at_s(base, 10.0) : at_s(base, 16.0)] if not isinstance(a.m, ImuSample)]
+    first_ns = {sensor: next(a.m.stamp_ns for a in others if a.m.sensor == sensor) for sensor in ("gnss", "compass")}
+    told = []
+    for a in others:
+        assert online.feed(a.m) is None
+        told += [(a.m, e) for e in online.events()]
+    ((m, event),) = told
+    gone_on_s = (m.stamp_ns - first_ns[m.sensor]) / 1e9
+    assert 3.0 <= gone_on_s < 3.5
+    assert event.warns
+    assert (
+        event.text
+        == f"imu: no sample has come while {m.sensor} went on for {gone_on_s:.1f} s: no new pose until one comes"
+    )
+
+    back = [a.m for a in base[at_s(base, 16.0) : at_s(base, 16.5)]]
+    again = [a.m for a in base[at_s(base, 16.5) : at_s(base, 20.5)] if not isinstance(a.m, ImuSample)]
+    for m in (*back, *again):
+        online.feed(m)
+    assert sum("no new pose until one comes" in e.text for e in online.events()) == 1
+
+
+def test_what_a_sensor_had_stored_tells_no_dead_imu() -> None:
+    """Six seconds of messages that come at once, after the IMU's samples; and a clock that is 18 s ahead."""
+    base = arrivals_of(run_of())
+    stored = base[at_s(base, 10.0) : at_s(base, 16.0)]
+    imu = [a.m for a in stored if isinstance(a.m, ImuSample)]
+    others = [a.m for a in stored if not isinstance(a.m, ImuSample)]
+    ahead = [replace(a.m, stamp_ns=a.m.stamp_ns + (0 if isinstance(a.m, ImuSample) else 18 * 10**9)) for a in stored]
+    for messages in ((*imu, *others), ahead):
+        online, _ = begun(10.0)
+        for m in messages:
+            online.feed(m)
+        assert not [e for e in online.events() if "no new pose" in e.text]
+
+
 def test_a_start_that_fails_keeps_the_ledger_complete(monkeypatch: pytest.MonkeyPatch) -> None:
     """The lag cannot be built: what came for it has its rows, and the next start is taken, with the heading that is configured."""
     heading_deg = float(90.0 - np.degrees(run_of().truth.yaw_rad[0]))

@@ -13,13 +13,16 @@ import pytest
 from ruamel.yaml import YAML
 
 from graphloc import factors
-from graphloc.config import load_config
-from graphloc.errors import ConfigError
+from graphloc.config import HeightConfig, VesselConfig, load_config, parse_config
+from graphloc.errors import ConfigError, InputError
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.eval.simulate.bag import write_bag as write_simulated
 from graphloc.extras import added
 from graphloc.factors import KINDS
-from tests.bagfactory import Messages, write_bag
+from graphloc.frontends import decode
+from graphloc.frontends.bag import check_bag, read_recording
+from graphloc.measurements import BodyVelocity
+from tests.bagfactory import START_NS, Messages, still_run, write_bag
 
 EXAMPLE = Path(__file__).parent.parent / "examples/range_beacon"
 Points = dict[str, dict[str, str]]
@@ -100,6 +103,10 @@ def test_a_broken_package_is_one_line(tmp_path: Path) -> None:
     [
         ({"graphloc.sensors": {"number": "math:pi"}}, "'number': is a float, no Sensor"),
         ({"graphloc.sensors": {"other": GOOD}}, "'other': its row is of kind 'range_beacon'"),
+        (
+            {"graphloc.sensors": {"range_beacon": "unlike:ROW"}},
+            "'range_beacon': the configuration of its row is no SensorConfig",
+        ),
     ],
 )
 def test_a_package_whose_entry_is_no_row_of_its_kind_is_refused(
@@ -107,13 +114,77 @@ def test_a_package_whose_entry_is_no_row_of_its_kind_is_refused(
 ) -> None:
     """As the table of sensors is made; how the command line says it, the test above shows."""
     installed(tmp_path / "site", points, EXAMPLE / "graphloc_range_beacon.py")
+    text = "from dataclasses import replace\nfrom graphloc_range_beacon import ROW\nROW = replace(ROW, config=dict)\n"
+    (tmp_path / "site/unlike.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path / "site")
     monkeypatch.setattr(factors, "added", added.__wrapped__)
     try:
         with pytest.raises(ConfigError) as caught:
             factors._theirs()  # noqa: SLF001
     finally:
-        sys.modules.pop("graphloc_range_beacon", None)
+        for module in ("graphloc_range_beacon", "unlike"):
+            sys.modules.pop(module, None)
     assert said in str(caught.value)
     assert "uninstall" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+SPEED_LOG = """import numpy as np
+from graphloc.measurements import BodyVelocity
+
+def decode(msg, stamp_ns, seq, sensor, config):
+    value = np.array([msg.range * 1852.0 / 3600.0])
+    return BodyVelocity(stamp_ns=stamp_ns, sensor=sensor, seq=seq, axes=("x",), value=value, cov=np.eye(1) * 0.01)
+
+DECODERS = {"sensor_msgs/msg/Range": decode}
+LIST = [decode]
+"""
+"""A speed log in knots in a message that graphloc does not take for one."""
+
+
+def with_a_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, entry: str) -> tuple[Path, VesselConfig]:
+    """A bag with an IMU, fixes and a log at 3.6 knots, read through a package that adds decoders of a kind."""
+    make = Messages(2)
+    log = {"radiation_type": 0, "field_of_view": 0.0, "min_range": 0.0, "max_range": 50.0, "range": 3.6}
+    items = still_run(make)
+    for k in range(20):
+        at_ns = START_NS + k * 100_000_000
+        items.append(("/log", at_ns, make.t["sensor_msgs/msg/Range"](header=make.header(at_ns), **log)))
+    bag = write_bag(tmp_path / "bag", make, items, kind="mcap")
+    installed(tmp_path / "site", {"graphloc.decoders": {kind: f"speed_log:{entry}"}})
+    (tmp_path / "site/speed_log.py").write_text(SPEED_LOG)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    monkeypatch.setattr(decode, "added", added.__wrapped__)
+    monkeypatch.delitem(sys.modules, "speed_log", raising=False)
+    imu, gnss = {"kind": "imu", "topic": "/imu"}, {"kind": "gnss", "topic": "/fix"}
+    raw = {"sensors": {"imu": imu, "gnss": gnss, "log": {"kind": "body_velocity", "topic": "/log"}}}
+    return bag, parse_config(raw, KINDS, "vessel.yaml")
+
+
+def test_a_package_may_add_a_message_of_its_own_to_a_kind_of_graphloc(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """3.6 knots are 1.852 m/s."""
+    bag, config = with_a_log(tmp_path, monkeypatch, "body_velocity", "DECODERS")
+    told = [m.value for m in read_recording((bag,), config).measurements if isinstance(m, BodyVelocity)]
+    np.testing.assert_allclose(told, np.full((20, 1), 1.852), rtol=1e-6)
+
+
+def test_decoders_that_are_no_table_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag, config = with_a_log(tmp_path, monkeypatch, "body_velocity", "LIST")
+    with pytest.raises(
+        ConfigError, match=r"graphloc.decoders: 'body_velocity': is a list, no dict .*: mend or uninstall"
+    ):
+        check_bag((bag,), config)
+
+
+def test_a_topic_of_a_kind_without_decoders_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A misnamed entry point of decoders: the topic would not be read, and nothing would say so."""
+    bag, config = with_a_log(tmp_path, monkeypatch, "body_velocety", "DECODERS")
+    sensors = {**config.sensors, "log": HeightConfig(topic="/log")}
+    with pytest.raises(
+        InputError, match=r"sensors.log.topic '/log': nothing reads a topic for kind 'height'.* graphloc.decoders"
+    ):
+        check_bag((bag,), config.model_copy(update={"sensors": sensors}))
+    off = {**sensors, "log": HeightConfig(topic="/log", enabled=False)}
+    check_bag((bag,), config.model_copy(update={"sensors": off}))

@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphloc.measurements import ImuSample, ImuSeries
+from graphloc.measurements import ImuSample, ImuSeries, Measurement
 from graphloc.signals.frozen_imu import FROZEN_IMU, FrozenImuDetector
 from graphloc.signals.imu_spikes import IMU_SPIKE, SpikeDetector
-from graphloc.time import stamps_of
+from graphloc.time import NS_PER_S, stamps_of
 
 # The clock was set back where so many samples in a row lie before the newest: by more than a gap, as they may be sent again; or in
 # order, among those in use where none is missing, with other readings. A clock that is set back by less catches up before.
@@ -25,6 +25,7 @@ _LATE_S = 3.0  # how late samples may come before the start
 _HOLE = 0.7  # share of the IMU's period: where no sample lies so near to either side, one is missing
 _FORCE_MPS2, _RATE_RADPS = (2.0, 100.0), 10.0  # limits for a vessel; readings in g or deg/s fall outside
 _BEHIND, _LOST = "its stamp does not increase", "held back as it leapt, and then the clock was set back"
+_SILENT_S = 3.0  # for which another sensor goes on without a sample: the IMU, or its driver, is dead
 _PERIODS = 1000  # newest steps between samples, from which the IMU's period is taken
 
 
@@ -106,6 +107,8 @@ class ImuIntake:
         self._spiked = False
         self._stamps: list[int] = []  # of the samples in use, in order, as far back as a late one may lie
         self._readings: dict[int, bytes] = {}  # of the newest samples in use, by stamp
+        self._since: dict[str, int] = {}  # by sensor, the first stamp that came since the last sample
+        self._told_silent = False
 
     def accept(self, m: ImuSample) -> float:
         """Make a sample the newest; return the time (s) since the one before it."""
@@ -125,8 +128,22 @@ class ImuIntake:
         """Forget older stamps."""
         del self._stamps[: bisect_left(self._stamps, before_ns)]
 
+    def silent_s(self, m: Measurement) -> float:
+        """Return, once in a silence of the IMU, for how long (s) another sensor has gone on without it; else 0.
+
+        A sensor whose clock is ahead, or that sends what it has stored, has not.
+        """
+        went_on_ns = m.stamp_ns - self._since.setdefault(m.sensor, m.stamp_ns)
+        ahead_ns = 0 if self.newest is None else m.stamp_ns - self.newest.stamp_ns
+        if self._told_silent or min(went_on_ns, ahead_ns) < _SILENT_S * NS_PER_S:
+            return 0.0
+        self._told_silent = True
+        return went_on_ns / NS_PER_S
+
     def take(self, m: ImuSample, *, started: bool) -> Taken:
         """Decide on a sample, and on those that are held back; `started`: whether there is an estimate."""
+        self._since.clear()
+        self._told_silent = False
         if self.newest is not None and self.newest.stamp_ns < m.stamp_ns <= self._spikes.held_ns:
             return Taken(dropped=((m, _BEHIND),))
         taken = self._in_order(m, started)

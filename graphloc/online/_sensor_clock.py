@@ -26,6 +26,7 @@ _STEADY = 0.75  # share of the measurements before that must have come with the 
 # Least change of the delay from one message to the next: where messages wait longer and longer, each waits at most
 # `_UNEVEN` of `_SLOWEST_S` longer than the one before.
 _AT_ONCE_S = 0.75
+_PAST_S = 60.0  # behind the IMU all the time: too late for any use
 _FUTURE_S = 3.0  # ahead of the IMU all the time: no message is so much faster
 
 
@@ -74,7 +75,7 @@ class SensorClock:
         ahead_ns, apart_ns, self._imu_ns = m.stamp_ns - imu_ns, imu_ns - self._imu_ns, imu_ns
         if len(self._ahead_ns) < _FEWEST:
             found = self._learn(m, ahead_ns, apart_ns)
-            return self._as_they_come(m) or PutRight(found, self._from_the_future(m.sensor))
+            return self._as_they_come(m) or PutRight(found, self._of_another_clock(m.sensor))
         before_ns = median(self._ahead_ns)
         by_ns = ahead_ns - round(before_ns)
         if abs(by_ns) < _SEEMS_S * NS_PER_S and not self._held:
@@ -113,13 +114,23 @@ class SensorClock:
         said = f"{m.sensor}: its clock was set again, unseen: its stamps are used as they come from {utc_text(m.stamp_ns)} on"
         return PutRight([*self._begin_anew(), m], said)
 
-    def _from_the_future(self, sensor: str) -> str:
-        """Return a line for users, once, if all stamps are ahead of the IMU's while the IMU goes on; else empty."""
-        least_s, goes_on = min(self._ahead_ns) / NS_PER_S, median(self._apart_ns) > 0
-        if self._said or len(self._ahead_ns) < _FEWEST or least_s < _FUTURE_S or not goes_on:
+    def _of_another_clock(self, sensor: str) -> str:
+        """Return a line for users, once, if all stamps are ahead of the IMU's, or far behind, while the IMU goes on; else empty."""
+        least_s, most_s, goes_on = (
+            min(self._ahead_ns) / NS_PER_S,
+            max(self._ahead_ns) / NS_PER_S,
+            median(self._apart_ns) > 0,
+        )
+        if (
+            self._said
+            or len(self._ahead_ns) < _FEWEST
+            or not (least_s >= _FUTURE_S or most_s <= -_PAST_S)
+            or not goes_on
+        ):
             return ""
         self._said = True
-        return f"{sensor}: its stamps are {least_s:.1f} s ahead of the IMU's: of another clock? (time_offset_s)"
+        off = f"{least_s:.1f} s ahead of" if least_s > 0.0 else f"{-most_s:.1f} s behind"
+        return f"{sensor}: its stamps are {off} the IMU's: of another clock? (time_offset_s)"
 
     def _begin_anew(self) -> list[Measurement]:
         self._ahead_ns.clear()

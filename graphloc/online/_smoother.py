@@ -196,6 +196,10 @@ class OnlineSmoother:
         if newest is None:
             self._take(m)
             return None
+        if silent_s := self._intake.silent_s(m):
+            self._say(
+                f"{newest.sensor}: no sample has come while {m.sensor} went on for {silent_s:.1f} s: no new pose until one comes"
+            )
         taken = self._persistent.clocks[m.sensor].take(m, newest.stamp_ns)
         self._say(taken.said)
         if taken.earlier_off_ns:

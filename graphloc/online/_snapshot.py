@@ -183,9 +183,10 @@ class SnapshotFile:
         self._written_ns = snapshot.anchor.stamp_ns
         try:
             snapshot.write(self._path)
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: a path that is no file's, as that of an empty text
             told, self._unwritable = self._unwritable, True
-            return "" if told else f"{self._path}: the snapshot cannot be written ({error.strerror or error})"
+            why = error.strerror if isinstance(error, OSError) and error.strerror else in_one_line(error)
+            return "" if told else f"{self._path}: the snapshot cannot be written ({why})"
         self._unwritable = False
         return ""
 

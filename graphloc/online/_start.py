@@ -31,6 +31,7 @@ from graphloc.online._setup import Setup
 from graphloc.online._unmeasured_heading import DOUBTFUL_RAD, UnmeasuredHeading
 from graphloc.online._unmodelled import BeforeStart
 from graphloc.recording import Recording
+from graphloc.signals.rates_in_degrees import swing_of_degrees
 from graphloc.solve.alignment import wanted_travel_m
 from graphloc.solve.batch import BatchResult, solve_batch
 from graphloc.solve.imu_mount import followed_before
@@ -108,6 +109,8 @@ def try_start(
     span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 if len(imu) else 0.0
     if span_s < LEAST_S:
         return f"{LEAST_S:g} s of IMU data"
+    if swing := swing_of_degrees(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps):
+        return f"IMU data that a vessel can have: it rolls and pitches by {np.degrees(swing):.0f} deg within 5 s: rates in deg/s?"
     recording = Recording(
         source="(online)",
         imu=imu,
