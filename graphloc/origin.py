@@ -30,7 +30,7 @@ def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sens
     """
     if config.datum is not None:
         datum = Datum(config.datum.geodetic)
-        _refuse_far_fixes(recording, datum)
+        refuse_far_fixes(recording, datum)
         return datum
     refuse_world_without_datum(config, recording.source, rows)
     found = fixes_of(recording)
@@ -48,7 +48,7 @@ def fixes_of(recording: Recording) -> list[GnssPosition]:
     return recording.of(GnssPosition)
 
 
-def _refuse_far_fixes(recording: Recording, datum: Datum) -> None:
+def refuse_far_fixes(recording: Recording, datum: Datum) -> None:
     """A forgotten minus sign puts the datum on the other side of the world, where nothing can be solved.
 
     Raises:

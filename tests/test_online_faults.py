@@ -21,6 +21,7 @@ from graphloc.config import GnssConfig, VesselConfig
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.factors.imu import Links
+from graphloc.frames import Geodetic
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, Measurement, PoseFix
 from graphloc.online import OnlineSmoother
@@ -196,6 +197,21 @@ def test_rates_in_degrees_are_waited_out() -> None:
         r"IMU data that a vessel can have: it rolls and pitches by \d+ deg within 5 s: rates in deg/s\?",
         online.waiting_for,
     )
+    assert online.events() == []
+
+
+def test_fixes_in_radians_are_waited_out() -> None:
+    """They lie a thousand kilometres from the matches: to solve a start with both blocked `feed` for two minutes, and failed."""
+    run = run_of()
+    base, online = arrivals_of(run), smoother(run)
+    assert run.config.datum is not None
+    for a in base[: at_s(base, 7.0)]:
+        m = a.m
+        if isinstance(m, GnssPosition):
+            lat, lon, height = m.position
+            m = replace(m, position=Geodetic(np.radians(lat), np.radians(lon), height))
+        assert online.feed(m) is None
+    assert re.search(r"its fixes lie \d+ km from `datum:`, near latitude 1\.0\d+", online.waiting_for)
     assert online.events() == []
 
 

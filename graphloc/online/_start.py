@@ -122,6 +122,7 @@ def try_start(
         return f"{_FIXES} GNSS fixes to set the origin, as no `datum:` is configured"
     try:
         datum = datum or origin.choose_datum(recording, config, setup.rows)
+        origin.refuse_far_fixes(recording, datum)
     except GraphlocError as error:
         return str(error)
     missing, told = _missing(setup, recording, datum, patient=span_s >= _LONGEST_WAIT_S)
