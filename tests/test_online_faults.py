@@ -226,11 +226,12 @@ def test_a_snapshot_without_a_name_does_not_keep_from_starting() -> None:
     assert not [text for text in texts if "failed" in text]
 
 
-def test_stamps_in_ms_are_said_to_be_of_another_clock() -> None:
-    """All fixes are then of 1970: none is used, and the ledger's reasons do not tell why."""
+@pytest.mark.parametrize("late", [lambda ns: ns // 10**6, lambda ns: ns - 15 * 10**9], ids=["ms", "15 s late"])
+def test_stamps_that_are_too_old_for_any_use_are_said_to_be_of_another_clock(late: Callable[[int], int]) -> None:
+    """In ms all fixes are of 1970: none is used, and the ledger's reasons do not tell why."""
     base, online = arrivals_of(run_of()), smoother(run_of())
     for a in base[: at_s(base, 7.0)]:
-        online.feed(replace(a.m, stamp_ns=a.m.stamp_ns // 10**6) if isinstance(a.m, GnssPosition) else a.m)
+        online.feed(replace(a.m, stamp_ns=late(a.m.stamp_ns)) if isinstance(a.m, GnssPosition) else a.m)
     said = [e for e in online.events() if "behind the IMU's: of another clock?" in e.text]
     assert [(e.text.split(":")[0], e.warns) for e in said] == [("gnss", True)]
 

@@ -26,7 +26,7 @@ _STEADY = 0.75  # share of the measurements before that must have come with the 
 # Least change of the delay from one message to the next: where messages wait longer and longer, each waits at most
 # `_UNEVEN` of `_SLOWEST_S` longer than the one before.
 _AT_ONCE_S = 0.75
-_PAST_S = 60.0  # behind the IMU all the time: too late for any use
+_PAST_S = 10.0  # behind the IMU all the time: older than the usual lag, of no use
 _FUTURE_S = 3.0  # ahead of the IMU all the time: no message is so much faster
 
 
