@@ -98,7 +98,7 @@ class Judge:
         at, residuals = self._entries.residuals_at(stream, i)
         if (away_m := min(r.size_m or 0.0 for r in residuals)) > _FAR_M:
             self._agreement.note(stream, m, None)
-            raise SolveError(f"it lies {away_m / 1e3:.0f} km away")
+            raise SolveError(f"{m.sensor}: it lies {away_m / 1e3:.0f} km away")
         if why := self.receivers.reject(stream, m, at, residuals[0]):
             self._entries.add(Entry(stream, i, Verdict.false(residuals[0], at, why)))
             if stream.receiver.jump.suspects(m.stamp_ns):
