@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import islice
 
+from graphloc.errors import printable
 from graphloc.frontends._draft_clock import clock_lines
 from graphloc.frontends._reports import (
     FITS_WITH_FIXES,
@@ -50,7 +51,7 @@ def render(inspection: Inspection) -> str:
     if inspection.tf_frames:
         lines += ["", f"frames in tf: {', '.join(inspection.tf_frames)}"]
     lines += [f"warning: {w}" for w in inspection.warnings]
-    return "\n".join(lines)
+    return "\n".join(printable(line) for line in lines)
 
 
 def _compass_lines(compass: CompassReport) -> list[str]:

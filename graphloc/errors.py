@@ -13,11 +13,19 @@ _LONGEST = 1500
 _UNDETERMINED = "Indeterminate linear system"  # all that GTSAM has to say of data, NaN among them
 
 
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
+
+
+def printable(text: str) -> str:
+    """Return a text as one line without control characters, which names in a bag may hold to drive a terminal."""
+    return _CONTROL.sub(" ", text)
+
+
 class GraphlocError(Exception):
     """Base of every error that graphloc raises on purpose. Its text is one line, whatever names of files or topics hold."""
 
     def __init__(self, text: str) -> None:
-        line = re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+", " ", text)
+        line = printable(text)
         super().__init__(line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}")
 
 

@@ -28,7 +28,7 @@ from graphloc.frontends import _unpack
 from graphloc.frontends._recover import recover
 from graphloc.frontends.aerial.image import AerialImage
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.inspect import inspect_bag
+from graphloc.frontends.inspect import inspect_bag, render
 from graphloc.frontends.lines import Trouble, parse
 from graphloc.ledger import Outcome
 from graphloc.recording import Recording
@@ -372,6 +372,16 @@ def test_an_error_is_one_line_whatever_names_hold(tmp_path: Path) -> None:
     assert text.isprintable()
     assert text.startswith("vessel.yaml: sensors.a ")
     assert len(text) < 1600
+
+
+@pytest.mark.parametrize("kind", ["mcap", "ros1"])
+def test_what_inspect_prints_drives_no_terminal(tmp_path: Path, kind: str) -> None:
+    make = Messages(1 if kind == "ros1" else 2)
+    items = [(topic.replace("imu", "imu\x1b[2J"), stamp_ns, msg) for topic, stamp_ns, msg in still_run(make)]
+    path = write_bag(tmp_path / ("run.bag" if kind == "ros1" else "run"), make, items, kind)
+    text = render(inspect_bag(path))
+    assert "/imu [2J" in text
+    assert all(line.isprintable() for line in text.splitlines())
 
 
 def test_a_sequence_of_nothing_is_no_memory(tmp_path: Path) -> None:

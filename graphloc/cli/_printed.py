@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from graphloc.errors import printable
 from graphloc.ledger import Ledger, Outcome
 from graphloc.signals.thinning import THINNED
 
@@ -29,7 +30,7 @@ def print_run(run: Run, page: Path, as_json: bool) -> None:
         for line in _as_text(run, data):
             typer.echo(line)
         for warning in data.warnings:
-            typer.echo(f"warning: {warning}", err=True)
+            typer.echo(printable(f"warning: {warning}"), err=True)
         for suggestion in run.calibration.suggestions if run.calibration is not None else ():
             typer.echo(f"calibration: {suggestion}", err=True)
     typer.echo(str(page))
