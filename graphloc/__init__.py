@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from graphloc.online import OnlineSmoother
     from graphloc.recording import Recording
     from graphloc.replay import arrivals
+    from graphloc.row_check import check_row
     from graphloc.solution import Solution
     from graphloc.trajectory import Trajectory
 
@@ -42,6 +43,7 @@ _HOMES = {
     "online": ("OnlineSmoother",),
     "recording": ("Recording",),
     "replay": ("arrivals",),
+    "row_check": ("check_row",),
     "solution": ("Solution",),
     "trajectory": ("Trajectory",),
 }  # fmt: skip
@@ -71,6 +73,7 @@ __all__ = [
     "VesselConfig",
     "__version__",
     "arrivals",
+    "check_row",
     "configured",
     "load",
     "online_smoother",

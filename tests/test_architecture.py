@@ -15,7 +15,7 @@ VOCABULARY = {
 }  # fmt: skip
 DOOR = {"__main__", "app", "cli", "drills", "found_tags", "gather", "replay", "stream", "job", "sweep", "ablations"}
 GRAPH = {
-    "graph", "inertial", "linear", "motion_model", "keys", "timeline", "build", "judge", "solve", "online", "origin", "outputs",
+    "graph", "inertial", "linear", "motion_model", "keys", "timeline", "build", "judge", "solve", "online", "origin", "outputs", "row_check",
 }  # fmt: skip
 FORBIDDEN = {
     "facade": set[str](),  # graphloc/__init__.py imports its public names when they are first used

@@ -1,6 +1,5 @@
 """Conformance of every row of the sensor table, from the table (style rule 27)."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal, cast
 
@@ -10,10 +9,11 @@ import pytest
 
 from graphloc.config import KernelConfig
 from graphloc.factors import KINDS, SENSORS
-from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frames import Datum, Geodetic
 from graphloc.graph import Attachment, Decision, FeltMotion, Sensor
 from graphloc.linear import factors_of
 from graphloc.measurements import AXES, CompassHeading, TagSighting
+from graphloc.row_check import away, slopes
 from tests.measurement_models import Camera, Situation, less, model, sensed
 
 DATUM = Datum(Geodetic(59.3, 18.1, 20.0))
@@ -105,37 +105,6 @@ def under_way(row: Sensor, settings: dict[str, Any], *, slow: bool) -> tuple[Any
     place = gtsam.Pose3(turned, at.lever_m + np.array([0.3, -0.1, 0.05]))
     slow_value = None if at.slow_value is None else many[: len(at.slow_value)]
     return config, replace(at, T_state_sensor=place, slow_value=slow_value, constants=constants, felt=felt)
-
-
-def moved(at: Attachment, key: int, step: Array) -> Attachment:
-    """The attachment after a step (n,) in the tangent of one of its states."""
-    if key == at.pose_key:
-        return replace(at, T_world_body=at.T_world_body.retract(step))
-    if key == at.velocity_key:
-        return replace(at, v_world_mps=at.v_world_mps + step)
-    if key == at.slow_key:
-        return replace(at, slow_value=np.asarray(at.slow_value) + step)
-    return replace(at, constants=tuple((k, value + step if k == key else value) for k, value in at.constants))
-
-
-def sizes_of(at: Attachment) -> dict[int, int]:
-    slow = {} if at.slow_key is None else {at.slow_key: len(np.asarray(at.slow_value))}
-    return {at.pose_key: 6, at.velocity_key: 3, **slow, **{key: len(value) for key, value in at.constants}}
-
-
-def slopes(of: Callable[[Attachment], Array], at: Attachment) -> dict[int, Array]:
-    """Central differences (k, n) by each state of an attachment, step 1e-5."""
-    return {
-        key: np.column_stack([(of(moved(at, key, step)) - of(moved(at, key, -step))) / 2e-5 for step in 1e-5 * np.eye(size)])
-        for key, size in sizes_of(at).items()
-    }  # fmt: skip
-
-
-def away(at: Attachment, by: float) -> Attachment:
-    """The attachment after a step in each of its states."""
-    for key, size in sizes_of(at).items():
-        at = moved(at, key, by * np.tile([1.0, -0.7, 0.4], 10)[:size])
-    return at
 
 
 @pytest.mark.parametrize(("row", "settings", "slow"), CASES)
