@@ -60,7 +60,8 @@ class Watch:
     def hook(self, event: str, arguments: tuple[Any, ...]) -> None:
         if not self.room:
             return
-        if event in _NEVER:
+        itself = event == "ctypes.dlopen" and arguments[0] is None  # the process, for `malloc_trim`: nothing is loaded
+        if event in _NEVER and not itself:
             self.seen.append(f"{event} {arguments[:2]!r}"[:200])
         elif event == "open" and isinstance(arguments[0], str | bytes | os.PathLike):
             _, mode, flags = arguments
