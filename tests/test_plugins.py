@@ -43,7 +43,6 @@ def graphloc(env: dict[str, str], *arguments: object) -> subprocess.CompletedPro
     return subprocess.run(command, env=env, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.usefixtures("coarse_image")
 def test_the_example_is_read_from_a_bag_and_used(tmp_path: Path) -> None:
     """Ranges to two beacons, one of them in the wrong place by 20 m: it is found out by the rest of the run."""
     rates = {"imu_hz": 50.0, "gnss_hz": 2.0, "compass_hz": 2.0}
