@@ -49,6 +49,15 @@ def coarse_image(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bag, "render", lambda harbour, seed: aerial.render(harbour, seed, pixel_m=2.0))
 
 
+@pytest.fixture
+def map_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report draws its map and no other figure, where nothing looks at them: they take longer than a short run."""
+    from graphloc.eval.report import _page
+
+    every = _page.figures
+    monkeypatch.setattr(_page, "figures", lambda data: {k: f for k, f in every(data).items() if k == "map"})
+
+
 @pytest.fixture(scope="session")
 def scanned_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a simulated run with scans of five LiDARs, twice a second for 16 s."""
