@@ -45,8 +45,9 @@ def graphloc(env: dict[str, str], *arguments: object) -> subprocess.CompletedPro
 
 def test_the_example_is_read_from_a_bag_and_used(tmp_path: Path) -> None:
     """Ranges to two beacons, one of them in the wrong place by 20 m: it is found out by the rest of the run."""
-    rates = {"imu_hz": 50.0, "gnss_hz": 2.0, "compass_hz": 2.0}
-    run = simulate_slowly(Scenario(duration_s=8.0, noise="clean", false_fraction=0.0, **rates), 4)
+    run = simulate_slowly(
+        Scenario(duration_s=8.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, noise="clean", false_fraction=0.0), 4
+    )
     bag, config = write_simulated(run, tmp_path / "bag", ros=2)
     make, right, wrong = Messages(2), np.array([-70.0, 90.0, 5.0]), np.array([60.0, 80.0, 5.0])
     items: list[Any] = []
