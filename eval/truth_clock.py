@@ -72,21 +72,19 @@ class ClockApart(NamedTuple):
 
 def clock_apart(track: Trajectory, truth: Trajectory) -> ClockApart | None:
     """Return how far a truth's clock is off the track's; None if it is not, or the motion does not show it."""
-    from scipy.signal import correlate  # takes a second to import, also for commands that have no truth
-
     seen = _velocities(track), _velocities(truth)
     if seen[0] is None or seen[1] is None:
         return None
     (u, known_u), (v, known_v) = seen[0], seen[1]
-    common = np.rint(correlate(known_u, known_v, method="fft"))  # number of steps, by shift
+    common = np.rint(_correlated(known_u, known_v))  # number of steps, by shift
     enough = common * _STEP_S >= max(_COMMON_S, _COMMON * _STEP_S * min(known_u.sum(), known_v.sum()))
     if not enough.any():
         return None
     n = np.maximum(common, 1.0)
-    mean_square = correlate((u**2).sum(axis=1), known_v, method="fft") / n
-    product = sum(correlate(u[:, k], v[:, k], method="fft") for k in range(2)) / n
-    differ = np.maximum(mean_square + correlate(known_u, (v**2).sum(axis=1), method="fft") / n - 2.0 * product, 1e-6)
-    varies = mean_square - sum((correlate(u[:, k], known_v, method="fft") / n) ** 2 for k in range(2))
+    mean_square = _correlated((u**2).sum(axis=1), known_v) / n
+    product = sum(_correlated(u[:, k], v[:, k]) for k in range(2)) / n
+    differ = np.maximum(mean_square + _correlated(known_u, (v**2).sum(axis=1)) / n - 2.0 * product, 1e-6)
+    varies = mean_square - sum((_correlated(u[:, k], known_v) / n) ** 2 for k in range(2))
     best = int(np.argmin(np.where(enough, differ, np.inf)))
     add_s = (int(track.stamps_ns[0]) - int(truth.stamps_ns[0])) / NS_PER_S + (best - (len(v) - 1)) * _STEP_S
     add_s += _STEP_S * _between(differ[best - 1 : best + 2])
@@ -100,6 +98,12 @@ def clock_apart(track: Trajectory, truth: Trajectory) -> ClockApart | None:
     if abs(add_s) < _LEAST_S or differ[best] > _ALIKE * varies[best] or fits:
         return None
     return ClockApart(add_s, float(np.sqrt(differ[best])), float(np.sqrt(differ[stamped])) if shared else None)
+
+
+def _correlated(a: Array, b: Array) -> Array:
+    """Return sum_k a[k + n] b[k] of two series (N,), (M,), by n from 1 - M to N - 1. That of SciPy takes over a second to import."""
+    shifts = len(a) + len(b) - 1
+    return np.asarray(np.fft.irfft(np.fft.rfft(a, shifts) * np.fft.rfft(b[::-1], shifts), shifts))
 
 
 def _velocities(track: Trajectory) -> tuple[Array, Array] | None:

@@ -44,9 +44,23 @@ def short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def coarse_image(monkeypatch: pytest.MonkeyPatch) -> None:
     """The aerial image beside a bag has pixels of 2 m, where nothing looks at it: drawn in full, it takes as long as the bag."""
+    _drawn_with(monkeypatch, 2.0)
+
+
+def _drawn_with(patch: pytest.MonkeyPatch, pixel_m: float) -> None:
+    """The aerial image beside a bag, drawn with pixels of this size."""
     from graphloc.eval.simulate import aerial, bag
 
-    monkeypatch.setattr(bag, "render", lambda harbour, seed: aerial.render(harbour, seed, pixel_m=2.0))
+    patch.setattr(bag, "render", lambda harbour, seed: aerial.render(harbour, seed, pixel_m=pixel_m))
+
+
+@pytest.fixture
+def map_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report draws its map and no other figure, where nothing looks at them: they take longer than a short run."""
+    from graphloc.eval.report import _page
+
+    every = _page.figures
+    monkeypatch.setattr(_page, "figures", lambda data: {k: f for k, f in every(data).items() if k == "map"})
 
 
 @pytest.fixture(scope="session")
@@ -78,7 +92,9 @@ def _made_once(factory: pytest.TempPathFactory, name: str, changes: dict[str, st
         # Half of the columns, so half of the points: what is done with them takes half as long.
         sparse = {name: lidar.model_copy(update={"step_deg": 0.4}) for name, lidar in run.rig.lidars.items()}
         rig = run.rig.model_copy(update={"lidars": sparse})
-        write_bag(replace(run, config=run.config.with_sensors({"aerial": aerial}), rig=rig), made, ros=2)
+        with pytest.MonkeyPatch.context() as patch:
+            _drawn_with(patch, 0.24)  # half of the usual pixels, and of the time, which is half of the bag's
+            write_bag(replace(run, config=run.config.with_sensors({"aerial": aerial}), rig=rig), made, ros=2)
         with suppress(OSError):  # another worker was quicker
             made.rename(folder)
     return folder

@@ -55,6 +55,7 @@ def eight_seconds(bag: Path) -> tuple[BagPart, Recording, VesselConfig]:
     return part, *app.load(part, bag / "vessel.yaml")
 
 
+@pytest.mark.usefixtures("map_alone")
 def test_from_a_bag_to_the_graph(bag: Path, tmp_path: Path) -> None:
     """Scans become matches of the second smoothing; the image's offset is estimated; the ledger adds up."""
     part, recording, vessel = eight_seconds(bag)

@@ -14,10 +14,11 @@ import pytest
 import graphloc
 from graphloc.blocks import MountConfig
 from graphloc.config import VesselConfig, load_config
-from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
+from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.factors import KINDS
 from graphloc.frames import rotation_from_rpy_deg
 from graphloc.replay import arrivals
+from tests.slowly import simulate_slowly
 
 ROOT = Path(__file__).parent.parent
 LEVER_M, TURN = np.array([0.5, -0.2, 1.1]), rotation_from_rpy_deg(np.array([180.0, 0.0, 92.0]))
@@ -25,7 +26,8 @@ LEVER_M, TURN = np.array([0.5, -0.2, 1.1]), rotation_from_rpy_deg(np.array([180.
 
 @cache
 def simulated() -> SimulatedRun:
-    return simulate(Scenario(duration_s=12.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, false_fraction=0.0), 3)
+    scenario = Scenario(duration_s=12.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, false_fraction=0.0)
+    return simulate_slowly(scenario, 3)
 
 
 def by_frame(config: VesselConfig, name: str) -> VesselConfig:
@@ -58,6 +60,7 @@ def test_a_mount_by_a_frame_that_nothing_tells_is_refused(name: str) -> None:
     assert graphloc.online_smoother(lost, mounts={name: (LEVER_M, TURN)}).waiting_for == "the first IMU sample"
 
 
+@pytest.mark.usefixtures("map_alone")
 def test_the_effective_configuration_has_mounts_in_numbers(tmp_path: Path) -> None:
     """So it serves where there is no /tf_static: a stream, a program."""
     run, lost = simulated(), by_frame(simulated().config, "gnss")

@@ -42,7 +42,7 @@ def with_imu(run: SimulatedRun, **settings: object) -> SimulatedRun:
 
 @pytest.fixture(scope="module")
 def cold() -> SimulatedRun:
-    return simulate_slowly(RUN, 1)
+    return simulate_slowly(RUN, 1, 1.25)
 
 
 @pytest.fixture(scope="module")

@@ -321,6 +321,7 @@ def test_noise_is_judged_by_samples_and_by_the_run(times: float, needed: float, 
         assert found[1].suggested == pytest.approx(rate, rel=0.1)
 
 
+@pytest.mark.usefixtures("map_alone")
 def test_it_is_written_and_shown(right: app.Run, tmp_path: Path) -> None:
     wrong = Suggestion(
         sensor="gnss", key="sensors.gnss.mount.xyz_m[0]", unit="m", configured=1.0, suggested=1.5, sigma=0.05, z=10.0,

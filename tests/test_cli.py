@@ -29,6 +29,8 @@ from graphloc.signals.thinning import THINNED
 from tests.commands import called
 from tests.slowly import simulate_slowly
 
+pytestmark = pytest.mark.usefixtures("map_alone")
+
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:

@@ -25,7 +25,7 @@ _OUTAGE_S, _TAU_S = (30.0, 70.0), 8.0
 def run() -> SimulatedRun:
     scenario = Scenario(
         path="loops", noise="clean", duration_s=130.0, outage_s=_OUTAGE_S, pose_hz=0.0, gnss_hz=1.0, compass_hz=1.0,
-        gnss_sigma_m=1.0,
+        gnss_sigma_m=1.0, imu_hz=50.0,
     )  # fmt: skip
     return simulate_slowly(scenario, 1)
 

@@ -24,6 +24,9 @@ from tests.slowly import simulate_slowly
 
 SECOND = 1_000_000_000
 FAR_M2 = 1e12
+SURE = replace(
+    bl_scenario(1, "clean"), false_fraction=0.0, duration_s=30.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0
+)  # fmt: skip
 PLANE = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # residuals of position, by x, y and yaw
 
 
@@ -187,7 +190,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array, Array]]:
 
 def test_matches_that_are_all_a_berth_off_leave_the_vessel_within_its_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """All take one boat for the next, 3.4 m off, where GNSS is good to 2 m; they say themselves that half of such are false."""
-    run = simulate_slowly(replace(bl_scenario(1, "clean"), false_fraction=0.0, duration_s=30.0), 3, rate_hz=2.5)
+    run = simulate_slowly(SURE, 3, rate_hz=2.5)
 
     def a_berth_off(news: float) -> Any:
         def moved(m: Measurement) -> Measurement:
@@ -227,7 +230,7 @@ def test_what_agrees_over_a_long_way_is_not_in_doubt(
     news: float, wider: tuple[float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without GNSS, matches of which each says that it may be false: 18 lengths of correlation that the IMU ties together, or two."""
-    run = simulate_slowly(replace(bl_scenario(1, "clean"), false_fraction=0.0, duration_s=30.0), 3, rate_hz=2.5)
+    run = simulate_slowly(SURE, 3, rate_hz=2.5)
 
     def doubtful(m: Measurement) -> Measurement:
         if not isinstance(m, PoseFix):

@@ -382,7 +382,7 @@ def test_a_long_recording_is_cut(recording: Recording, monkeypatch: pytest.Monke
 
 @pytest.fixture(scope="module")
 def drilled() -> tuple[SimulatedRun, Drilled]:
-    scenario = Scenario(duration_s=27.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, noise="clean", false_fraction=0.0)
+    scenario = Scenario(duration_s=27.0, imu_hz=50.0, gnss_hz=1.0, compass_hz=1.0, noise="clean", false_fraction=0.0)
     run = simulate_slowly(scenario, 2)
     with pytest.MonkeyPatch.context() as patch:
         for name in ("LEAD_S", "TAIL_S"):

@@ -47,7 +47,10 @@ def test_the_filters_turn_headings_and_velocities() -> None:
 @pytest.mark.parametrize("online", [False, True])
 def test_far_from_the_datum_headings_count_from_where_the_vessel_is(online: bool) -> None:
     """North there is 0.9 deg off."""
-    run = simulate_slowly(Scenario(path="loops", duration_s=30.0, noise="clean", pose_hz=0.0, imu_hz=50.0), 5)
+    scenario = Scenario(
+        path="loops", duration_s=30.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=5.0
+    )  # fmt: skip
+    run = simulate_slowly(scenario, 5)
     near = app.choose_datum(run.recording, run.config)
     origin = Geodetic(*near.geodetic_from_enu(np.array([[-60_000.0, 0.0, 0.0]]))[0])
     gyrocompass = {"topic": "/h", "mount_offset_sigma_deg": 0.0, "deviation_sigma_deg": 0.0, "wander_sigma_deg": 0.0}

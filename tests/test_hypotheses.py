@@ -172,7 +172,7 @@ def test_nothing_but_noise_makes_no_long_chain() -> None:
     ],
 )
 def test_false_matches_that_repeat_do_not_bend_the_track(noise: Any, seed: int, why: str) -> None:
-    run = sparsely(simulate_slowly(bl_scenario(3, noise), seed, rate_hz=2.5))
+    run = sparsely(simulate_slowly(bl_scenario(3, noise), seed, rate_hz=1.25))
     assert compare_to_truth(app.simulated(run).solution.trajectory, run.truth).position_rmse_m < 0.2, why
 
 
@@ -180,7 +180,7 @@ def test_matches_that_are_refused_together_are_reported() -> None:
     """For 20 s all say 15 m beside: so many are not false by chance. Usual ones, 40 % of them, are not said."""
     run = sparsely(
         simulate_slowly(
-            replace(bl_scenario(1, "clean"), duration_s=42.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0), 3, rate_hz=2.5
+            replace(bl_scenario(1, "clean"), duration_s=42.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0), 3, rate_hz=1.25
         )
     )
     begin_ns = int(run.truth.stamps_ns[0]) + 15_000_000_000
@@ -220,7 +220,7 @@ def test_few_or_brief_ones_are_no_news() -> None:
 def test_long_outage_does_not_lock_the_matches_out() -> None:
     """After 40 s without fixes and matches the prediction is metres off: the returning matches are believed."""
     scenario = replace(bl_scenario(1, "drift"), duration_s=100.0, outage_s=(40.0, 80.0))
-    run = sparsely(simulate_slowly(scenario, 5, rate_hz=2.5))
+    run = sparsely(simulate_slowly(scenario, 5, rate_hz=1.25))
     solution = app.simulated(run).solution
     after = run.truth.stamps_ns[(run.truth.stamps_ns - run.truth.stamps_ns[0]) > 90_000_000_000]
     error = solution.trajectory.at(after[:-200]).p_world_m - run.truth.at(after[:-200]).p_world_m

@@ -40,9 +40,9 @@ run_of, begun = partial(faults.run_of, rate_hz=RATE_HZ), partial(faults.begun, r
 Change = Callable[[Measurement], Measurement]
 
 
-def changed(change: Change, from_s: float = 12.0, until_s: float = 16.0) -> Arrivals:
+def changed(change: Change, from_s: float = 12.0, until_s: float = 16.0, length_s: float = 26.0) -> Arrivals:
     """The run with what came in a span changed."""
-    arrivals = arrivals_of(run_of())
+    arrivals = arrivals_of(run_of(length_s=length_s))
     begin = arrivals[0].true_ns
     inside = [from_s <= (a.true_ns - begin) / S < until_s for a in arrivals]
     return [replace(a, m=change(a.m)) if n else a for a, n in zip(arrivals, inside, strict=True)]
@@ -132,11 +132,11 @@ def test_it_is_left_out_only_where_a_motion_of_a_vessel_explains_the_denials(
 
 
 def smoothed(
-    change: Change, from_s: float = 12.0, until_s: float = 16.0, rate_hz: float = 1.25
+    change: Change, from_s: float = 12.0, until_s: float = 16.0, rate_hz: float = 1.25, length_s: float = 26.0
 ) -> tuple[Solution, Recording, TrackErrors]:
     """The same offline."""
-    run = slowly(run_of(), rate_hz)
-    samples = [a.m for a in changed(change, from_s, until_s) if isinstance(a.m, ImuSample)]
+    run = slowly(run_of(length_s=length_s), rate_hz)
+    samples = [a.m for a in changed(change, from_s, until_s, length_s) if isinstance(a.m, ImuSample)]
     assert run.recording.imu is not None
     imu = replace(
         run.recording.imu,
@@ -167,7 +167,7 @@ def test_offline_it_is_left_out_where_it_is_wrong(change: Change) -> None:
 
 def test_offline_it_is_found_in_the_first_window() -> None:
     """Aligned to rates that are wrong there, the run ended 122 m and 180 deg off, and took 15 times as long."""
-    solution, _, off = smoothed(in_degrees, 6.0, 9.0, rate_hz=0.625)
+    solution, _, off = smoothed(in_degrees, 6.0, 9.0, rate_hz=0.625, length_s=16.0)
     assert np.linalg.norm(off.position_m[:, :2], axis=1).max() < 1.0
     assert np.abs(off.heading_rad).max() < np.radians(8.0)
     assert any("contradicts the other sensors, which agree" in w for w in solution.stats.warnings)

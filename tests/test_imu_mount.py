@@ -19,7 +19,7 @@ from graphloc.solution import Solution
 from graphloc.solve._solution import make_solution
 from graphloc.solve.batch import BatchResult
 from graphloc.solve.imu_mount import MountError, mount_error
-from tests.slowly import simulate_slowly
+from tests.slowly import simulate_slowly, slowly
 
 ASKEW_DEG = (0.0, 0.0, 3.0)
 
@@ -150,6 +150,7 @@ def test_states_follow_the_mount_as_reckoned(simulated: SimulatedRun) -> None:
 def test_online_the_newest_state_follows_the_mount_as_its_bounds_say(simulated: SimulatedRun) -> None:
     """Turned by a bit of its sigma about each axis in turn, the IMU moves place, heading and velocity by as much of what they are widened by."""
     share = 0.2
+    simulated = slowly(simulated)
     as_given, widened = (replay(r.recording, r.config).solution for r in (taken_as_given(simulated), simulated))
     track = as_given.trajectory
     moved = []

@@ -93,7 +93,7 @@ def test_bounds_include_an_error_that_lasts() -> None:
 
 
 def test_bounds_include_an_error_that_lasts_online() -> None:
-    run = with_usbl(1, sigma_m=SIGMA_M, time_constant_s=TIME_S)
+    run = with_usbl(1, 200.0, sigma_m=SIGMA_M, time_constant_s=TIME_S)
     assert_honest(run, replay(run.recording, run.config).solution)
 
 

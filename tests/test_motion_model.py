@@ -146,7 +146,9 @@ def test_without_a_place_it_drifts_as_far_as_a_vessel_can_and_no_farther(lost: L
 
 
 def test_offline_too(lost: Lost) -> None:
-    assert_drifts_as_a_vessel_can(app.smooth_recording(lost.recording, lost.config).solution.trajectory, lost)
+    assert_drifts_as_a_vessel_can(
+        app.smooth_recording(lost.recording, with_few_states(lost.config, 1.25)).solution.trajectory, lost
+    )
 
 
 TIMELINE = make_timeline(0, 60 * SECOND, [], TimelineConfig(rate_hz=2.0))

@@ -167,7 +167,10 @@ def minutes(deg: float, sides: str, width: int) -> str:
 
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
-    return simulate(Scenario(path="loops", duration_s=40.0, noise="clean", pose_hz=0.0, gnss_hz=5.0, compass_hz=5.0), 4)
+    scenario = Scenario(
+        path="loops", duration_s=40.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0
+    )  # fmt: skip
+    return simulate(scenario, 4)
 
 
 @pytest.fixture(scope="module")

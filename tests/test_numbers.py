@@ -25,7 +25,9 @@ HEADING, YAW = "/mavros/global_position/compass_hdg", "/boat/yaw"
 
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
-    return simulate(Scenario(path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, gnss_hz=5.0, compass_hz=5.0), 4)
+    return simulate(
+        Scenario(path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0), 4
+    )
 
 
 @pytest.fixture(scope="module", params=[1, 2])

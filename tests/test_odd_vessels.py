@@ -103,7 +103,7 @@ def test_from_a_draft_to_a_track(kind: str, heading_deg: float, tmp_path: Path) 
     draft = tmp_path / "vessel.yaml"
     draft.write_text(draft_config(inspect_bag(bag)))
     recording, config = app.load([bag], draft)
-    config = with_few_states(config)
+    config = with_few_states(config, 1.25)
     assert {s.kind for s in config.sensors.values() if s.enabled} == {"imu", "gnss", kind}
     solved = app.smooth_recording(recording, config)
     ours = compare_to_truth(solved.solution.trajectory, world_of(solved, run))

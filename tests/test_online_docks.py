@@ -14,7 +14,7 @@ from graphloc.estimate import Estimate
 from graphloc.eval.simulate import SimulatedRun, find_scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array
-from graphloc.measurements import TagSighting
+from graphloc.measurements import Measurement, TagSighting
 from graphloc.online import OnlineSmoother
 from graphloc.online._anchor import without_priors
 from graphloc.online._lag import Lag
@@ -23,6 +23,7 @@ from graphloc.replay import arrivals, replay
 from graphloc.solution import Solution
 from graphloc.trajectory import Trajectory
 from tests import tagfactory
+from tests.faults import copied
 from tests.slowly import with_few_states
 
 
@@ -94,33 +95,46 @@ def test_tags_that_come_late_are_the_place_of_a_batch() -> None:
     assert off_m[-1] < 1.0
 
 
-def estimated(
-    config: VesselConfig, until_s: float, monkeypatch: pytest.MonkeyPatch, fails_s: float = np.inf
-) -> Estimate:
-    """The docking's estimate at a time; `fails_s`: when the solver fails."""
-    run, whole, fails = docking(), Lag.commit, False
+FAILS_S, UNTIL_S = 29.0, 31.0
+
+
+def came(from_s: float, until_s: float) -> list[Measurement]:
+    """What arrives of the docking in a span."""
+    begin_ns = docking().truth.stamps_ns[0]
+    return [m for m in arrivals(recorded()) if from_s <= (m.stamp_ns - begin_ns) * 1e-9 < until_s]
+
+
+def until_it_fails(config: VesselConfig) -> OnlineSmoother:
+    online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL, mounts=recorded().mounts)
+    for m in came(-np.inf, FAILS_S):
+        online.feed(m)
+    assert not any("rebuilt" in event.text for event in online.events())
+    return online
+
+
+def two_seconds_later(online: OnlineSmoother, monkeypatch: pytest.MonkeyPatch, *, fails: bool) -> Estimate:
+    """The last estimate, of a solver that fails, or not, at their begin."""
+    whole, estimates = Lag.commit, list[Estimate]()
 
     def once(self: Lag) -> None:
         monkeypatch.setattr(Lag, "commit", whole)
         raise RuntimeError("planted")
 
-    online = OnlineSmoother(config, rows=SENSORS, inertial=INERTIAL, mounts=recorded().mounts)
-    for m in arrivals(recorded()):
-        estimate = online.feed(m)
-        since_s = (m.stamp_ns - run.truth.stamps_ns[0]) * 1e-9
-        if not fails and since_s > fails_s:
-            monkeypatch.setattr(Lag, "commit", once)
-            fails = True
-        if estimate is not None and since_s > until_s:
-            break
+    if fails:
+        monkeypatch.setattr(Lag, "commit", once)
+    for m in came(FAILS_S, UNTIL_S):
+        if (estimate := online.feed(m)) is not None:
+            estimates.append(estimate)
     assert any("rebuilt" in event.text for event in online.events()) == fails
-    assert estimate is not None
-    return estimate
+    return estimates[-1]
 
 
 def test_a_rebuild_does_not_make_it_surer(monkeypatch: pytest.MonkeyPatch) -> None:
     """What closes the chains of dock and tide is no news a second time."""
-    estimate, track = estimated(docking().config, 31.0, monkeypatch, 29.0), followed().trajectory
+    estimate, track = (
+        two_seconds_later(until_it_fails(docking().config), monkeypatch, fails=True),
+        followed().trajectory,
+    )
     k = int(np.searchsorted(track.stamps_ns, estimate.stamp_ns))
     assert track.stamps_ns[k] == estimate.stamp_ns
     assert np.sqrt(np.diagonal(estimate.cov)[:3]) == pytest.approx(sigmas_m(track, k), rel=0.1)
@@ -133,7 +147,10 @@ def test_nor_where_tags_are_surveyed_to_half_a_metre(monkeypatch: pytest.MonkeyP
     listed = [tag.model_copy(update={"sigma_m": 0.5}) for tag in tags.survey.tags]
     unsure = tags.model_copy(update={"survey": tags.survey.model_copy(update={"tags": listed})})
     config = config.with_sensors({"tags": unsure})
-    whole, again = (estimated(config, 31.0, monkeypatch, fails_s).cov for fails_s in (np.inf, 29.0))
+    online = until_it_fails(config)
+    whole, again = (
+        two_seconds_later(one, monkeypatch, fails=fails).cov for one, fails in ((copied(online), False), (online, True))
+    )
     assert np.sqrt(np.diagonal(again)[:3]) == pytest.approx(np.sqrt(np.diagonal(whole)[:3]), rel=0.1)
 
 

@@ -9,12 +9,14 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure as Sheet
 
 from graphloc import app
 from graphloc.config import OutputConfig, VesselConfig
 from graphloc.eval import plots
 from graphloc.eval.ekf import FilterResult
 from graphloc.eval.metrics import Antennas
+from graphloc.eval.plots import paper
 from graphloc.eval.plots.paper import drawn as on_paper
 from graphloc.eval.plots.paper import write_figures
 from graphloc.eval.report import ReportData, figures
@@ -203,7 +205,9 @@ def test_points_of_the_map_are_where_the_fixes_are(data: ReportData) -> None:
     assert len(gnss.x) == len(gnss.y) == len(gnss.weight) == len(gnss.text)
 
 
-def test_every_figure_as_png_and_svg(data: ReportData, tmp_path: Path) -> None:
+def test_every_figure_as_png_and_svg(data: ReportData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Where there is room for all that is drawn, matplotlib works out anew for each file, which takes as long as to draw it.
+    monkeypatch.setattr(paper, "Sheet", lambda **options: Sheet(**{**options, "layout": None}))
     made = figures(data)
     write_figures(tuple(made.values()), tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {f"{name}.{end}" for name in made for end in ("png", "svg")}

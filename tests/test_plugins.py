@@ -15,7 +15,7 @@ from ruamel.yaml import YAML
 from graphloc import factors
 from graphloc.config import HeightConfig, VesselConfig, load_config, parse_config
 from graphloc.errors import ConfigError, InputError
-from graphloc.eval.simulate import Scenario, simulate
+from graphloc.eval.simulate import Scenario
 from graphloc.eval.simulate.bag import write_bag as write_simulated
 from graphloc.extras import added
 from graphloc.factors import KINDS
@@ -23,6 +23,7 @@ from graphloc.frontends import decode
 from graphloc.frontends.bag import check_bag, read_recording
 from graphloc.measurements import BodyVelocity
 from tests.bagfactory import START_NS, Messages, still_run, write_bag
+from tests.slowly import simulate_slowly
 
 EXAMPLE = Path(__file__).parent.parent / "examples/range_beacon"
 Points = dict[str, dict[str, str]]
@@ -47,11 +48,13 @@ def graphloc(env: dict[str, str], *arguments: object) -> subprocess.CompletedPro
 
 def test_the_example_is_read_from_a_bag_and_used(tmp_path: Path) -> None:
     """Ranges to two beacons, one of them in the wrong place by 20 m: it is found out by the rest of the run."""
-    run = simulate(Scenario(duration_s=8.0, noise="clean", false_fraction=0.0), 4)
+    run = simulate_slowly(
+        Scenario(duration_s=8.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0, noise="clean", false_fraction=0.0), 4
+    )
     bag, config = write_simulated(run, tmp_path / "bag", ros=2)
     make, right, wrong = Messages(2), np.array([-70.0, 90.0, 5.0]), np.array([60.0, 80.0, 5.0])
     items: list[Any] = []
-    for k in range(0, len(run.truth), 50):
+    for k in range(0, len(run.truth), 25):
         at_ns = int(run.truth.stamps_ns[k])
         for topic, place in (("/right", right), ("/wrong", wrong)):
             away_m = float(np.linalg.norm(run.truth.p_world_m[k] - place)) if k != 50 else 0.0

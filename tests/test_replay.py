@@ -90,6 +90,7 @@ def test_each_pose_is_as_it_was_known_then(run: SimulatedRun, whole: Replayed) -
     )
 
 
+@pytest.mark.usefixtures("map_alone")
 def test_scans_are_matched_around_its_own_prediction(scanned_bag: Path, tmp_path: Path) -> None:
     """From a bag to a run folder; no match is made before there is a pose, and each turn that is refused says why."""
     done = CliRunner().invoke(

@@ -183,6 +183,7 @@ def test_nothing_is_left_half_written(run: app.Run, tmp_path: Path, monkeypatch:
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.usefixtures("map_alone")
 def test_the_commands_write_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -53,10 +53,10 @@ def stating(run: SimulatedRun, kind: type[Measurement], share: float) -> Simulat
     return replace(run, recording=recording)
 
 
-def matched(seed: int, duration_s: float = 40.0, rate_hz: float = 2.5) -> SimulatedRun:
+def matched(seed: int, duration_s: float = 40.0, rate_hz: float = 2.5, gnss_hz: float = 5.0) -> SimulatedRun:
     """BL's case 1 with matches of 0.3 m, 40 % of them false, and GNSS that drifts."""
     scenario = replace(
-        bl_scenario(1, "drift"), duration_s=duration_s, pose_hz=4.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=2.0
+        bl_scenario(1, "drift"), duration_s=duration_s, pose_hz=4.0, imu_hz=50.0, gnss_hz=gnss_hz, compass_hz=2.0
     )
     return simulate_slowly(scenario, seed, rate_hz)
 
@@ -120,7 +120,7 @@ def test_few_steps_and_false_ones_alone_tell_nothing() -> None:
 
 
 def test_matches_that_state_a_third_of_their_noise_are_taken_as_they_scatter() -> None:
-    right = matched(1, 30.0)
+    right = matched(1, 30.0, 1.25, gnss_hz=2.0)
     run = stating(right, PoseFix, 1 / 3)
     solved, as_stated = (app.smooth_recording(r.recording, r.config).solution for r in (run, right))
     found, best = (compare_to_truth(s.trajectory, run.truth) for s in (solved, as_stated))

@@ -184,6 +184,7 @@ def test_held_out_fixes_are_counted_and_predicted() -> None:
     assert table["horizontal_rmse_m"] < 0.5
 
 
+@pytest.mark.usefixtures("map_alone")
 def test_run_folder(short: app.Run, tmp_path: Path) -> None:
     report = app.write(short, tmp_path / "run", inputs=[], command="test", overwrite=False)
     folder = report.parent

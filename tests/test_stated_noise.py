@@ -91,7 +91,7 @@ def test_matches_that_state_a_tenth_of_their_noise_do_not_throw_the_start() -> N
         return replace(m, modes=tuple(replace(mode, cov=0.01 * mode.cov) for mode in m.modes))
 
     recording = run.recording.changed(told)
-    run = slowly(replace(run, recording=recording), 2.5)
+    run = slowly(replace(run, recording=recording), 1.25)
     solution = app.smooth_recording(run.recording, run.config).solution
     assert compare_to_truth(solution.trajectory, run.truth).position_rmse_m < 0.6
     assert solution.stats.iterations < 200

@@ -25,7 +25,8 @@ from graphloc.eval.simulate.bag import write_bag
 from graphloc.job import Job, Row, check, run_job, variations
 from tests.commands import called
 
-SHORT = Job(scenario="bl1-drift", changes=(("duration_s", "6"), ("imu_hz", "50")))
+LESS = {"duration_s": "6", "imu_hz": "50", "gnss_hz": "5", "compass_hz": "2"}
+SHORT = Job(scenario="bl1-drift", changes=tuple(LESS.items()))
 BROKEN = replace(SHORT, config_changes=(("sensors.imu.enabled", "false"),))
 
 
@@ -166,7 +167,7 @@ def test_a_scheduler_by_address_and_one_that_is_not_there(tmp_path: Path, monkey
         monkeypatch.setattr(sweep, "run_job", killed)
         (row,) = sweep.sweep([SHORT], tmp_path / "d", scheduler=cluster.scheduler_address)
         assert (row["case"], row["error"]) == (
-            "bl1-drift duration_s=6 imu_hz=50",
+            "bl1-drift duration_s=6 imu_hz=50 gnss_hz=5 compass_hz=2",
             "its worker died: MemoryError: all of it",
         )
         monkeypatch.setattr(sweep, "_versions", lambda: {"thread": threading.current_thread().name})

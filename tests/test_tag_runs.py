@@ -317,6 +317,7 @@ def test_bounds_at_the_berth_hold(fixed: Docked) -> None:
     assert np.percentile(off_m[range_m < 5.0], 95) < 0.05
 
 
+@pytest.mark.usefixtures("map_alone")
 def test_a_tag_that_is_not_surveyed_is_found(fixed: Docked, tmp_path: Path) -> None:
     """One of 0.3 m where tag 228 hangs; it is written with the others, and the file is a survey."""
     app.write(fixed.run, tmp_path / "out", inputs=[], command="", overwrite=False)

@@ -37,7 +37,9 @@ from tests.test_bag_bad_input import accounted, rows_of, vessel
 @pytest.fixture(scope="module")
 def run() -> SimulatedRun:
     """Four minutes of turns, a gyroscope with a bias of 0.5 deg/s."""
-    return simulate(Scenario(path="loops", duration_s=240.0, noise="clean", pose_hz=0.0, gyro_bias_radps=0.01), 31)
+    return simulate(
+        Scenario(path="loops", duration_s=240.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gyro_bias_radps=0.01), 31
+    )
 
 
 def of(run: SimulatedRun) -> tuple[ImuSeries, list[CompassHeading]]:
