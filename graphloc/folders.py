@@ -13,8 +13,6 @@ from pathlib import Path
 
 from graphloc.errors import OutputError
 
-_UNFINISHED = ".graphloc-"  # how the name of a folder begins that is being filled, or was when its process was killed
-
 
 def check_folder(folder: Path, *, overwrite: bool, mark: str) -> None:
     """Refuse a folder that `fresh_folder` would refuse, before the work is done.
@@ -26,8 +24,7 @@ def check_folder(folder: Path, *, overwrite: bool, mark: str) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file, and a folder is wanted")
-    begun = folder.exists() and any(not p.name.startswith(_UNFINISHED) for p in folder.iterdir())
-    if begun and not (overwrite and (folder / mark).exists()):
+    if folder.exists() and not (overwrite and (folder / mark).exists()) and any(folder.iterdir()):
         what = (
             f"holds no {mark}, so graphloc did not make it: it is not replaced"
             if overwrite
@@ -53,41 +50,44 @@ def check_writable(path: Path) -> None:
 
 @contextmanager
 def fresh_folder(folder: Path, *, overwrite: bool, mark: str) -> Iterator[Path]:
-    """Yield a folder to fill; move it to `folder` when all went well, and drop it when not.
-
-    A folder that is there is kept, its content replaced: it may be a link, mounted, or where the user stands.
+    """Yield a folder to fill; put it in the place of `folder` when all went well, and drop it when not.
 
     Raises:
         OutputError: `folder` exists and may not be replaced, or the disk refuses; what was filled already is kept then.
     """
     check_folder(folder, overwrite=overwrite, mark=mark)
-    fresh, filled = None, False
+    place, fresh, filled = folder.resolve(), None, False  # where it is a link, what it leads to is replaced
     try:
-        there = folder.exists()
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder if there else folder.parent))
+        place.parent.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place if _stays(place) else place.parent))
         fresh.chmod(0o755)
         yield fresh
         filled = True
-        if there:
-            _replace_content(folder, fresh)
-        else:
-            fresh.rename(folder)
+        _put_in_place(fresh, place)
     except OSError as error:
-        kept = f"; what was made lies in {fresh}" if filled else ""
+        kept = f"; what was made lies in {fresh}" if filled and fresh is not None and fresh.exists() else ""
         raise OutputError(f"{folder}: cannot be written ({error.strerror or error}){kept}") from error
     finally:
         if fresh is not None and not filled:
             shutil.rmtree(fresh, ignore_errors=True)
 
 
-def _replace_content(folder: Path, fresh: Path) -> None:
-    """Replace what is in a folder by what is in one inside of it."""
-    for old in list(folder.iterdir()):
-        if old.is_symlink() or not old.is_dir():
-            old.unlink()
-        elif old.name != fresh.name:
+def _stays(place: Path) -> bool:
+    """Return whether a folder is there and cannot be replaced as a whole: mounted, where the user stands, or in a folder of another's."""
+    return place.is_dir() and (place.is_mount() or place == Path.cwd() or not os.access(place.parent, os.W_OK))
+
+
+def _put_in_place(fresh: Path, place: Path) -> None:
+    if fresh.parent != place:
+        if place.exists():
+            shutil.rmtree(place)
+        fresh.rename(place)
+        return
+    for old in [p for p in place.iterdir() if p != fresh]:
+        if old.is_dir() and not old.is_symlink():
             shutil.rmtree(old)
+        else:
+            old.unlink()
     for new in list(fresh.iterdir()):
-        new.rename(folder / new.name)
+        new.rename(place / new.name)
     fresh.rmdir()

@@ -114,7 +114,7 @@ def check(jobs: Sequence[Job]) -> None:
                 examples[job.scenario] = simulate(scenario, job.seed)
             _simulated_config(examples[job.scenario], job)
             continue
-        config = app.configured(Path(job.config), _values(job.config_changes))
+        config = app.configured(Path(job.config), values_of(job.config_changes))
         check_bag([Path(job.bag)], config)
         app.truth_of_file(job.config, config)
         if not (config.truth or config.check_speed_topic or job.hold_out):
@@ -123,7 +123,12 @@ def check(jobs: Sequence[Job]) -> None:
             )
 
 
-def _values(changes: Changes) -> dict[str, object]:
+def values_of(changes: Changes) -> dict[str, object]:
+    """Return changes of a configuration, their values read as YAML.
+
+    Raises:
+        ConfigError: a value is none.
+    """
     found: dict[str, object] = {}
     for key, text in changes:
         try:
@@ -137,7 +142,7 @@ def _simulated_config(run: SimulatedRun, job: Job) -> VesselConfig:
     if not job.config_changes:
         return run.config
     return parse_config(
-        with_changes(effective(run.config), _values(job.config_changes), job.scenario), KINDS, job.scenario
+        with_changes(effective(run.config), values_of(job.config_changes), job.scenario), KINDS, job.scenario
     )
 
 
@@ -177,5 +182,5 @@ def _recorded(job: Job, folder: Path) -> tuple[Recording, VesselConfig, app.Scan
         if not config.of_kind("aerial") and not config.of_kind("apriltag"):
             return run.recording, config, None
         bag, path = write_bag(run, folder / "run", ros=2)
-    recording, config = app.load([bag], path, changes=_values(job.config_changes))
+    recording, config = app.load([bag], path, changes=values_of(job.config_changes))
     return recording, config, app.Scans((bag,), path.parent)

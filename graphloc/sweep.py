@@ -24,7 +24,7 @@ from graphloc.errors import InputError, OutputError, in_one_line
 from graphloc.eval import sweep_table
 from graphloc.extras import need
 from graphloc.folders import check_folder
-from graphloc.job import Job, Row, check, run_job
+from graphloc.job import Job, Row, check, run_job, values_of
 from graphloc.plain import plain
 from graphloc.recording import Progress, quiet
 
@@ -84,8 +84,9 @@ def sweep(
 
 def _inputs(jobs: Sequence[Job], folder: Path, overwrite: bool) -> dict[str, str]:
     """Return the hashes of all inputs, with those of a sweep that is continued; refuse a folder that cannot be used."""
-    pairs = sorted({(job.bag, job.config) for job in jobs if job.config})
-    paths = {path for bag, config in pairs for path in app.inputs_of([Path(bag)], Path(config))}
+    kinds = {(job.bag, job.config, job.config_changes) for job in jobs if job.config}
+    made_of = (app.inputs_of([Path(bag)], Path(config), values_of(changes)) for bag, config, changes in kinds)
+    paths = {path for paths in made_of for path in paths}
     hashes = {str(path): app.sha256(path) for path in sorted(paths)}
     mark = folder / MARK
     if mark.exists() and not overwrite:
@@ -114,7 +115,7 @@ def _begin(folder: Path, hashes: Mapping[str, str], overwrite: bool) -> None:
         )
         fresh.replace(mark)
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be written ({error.strerror})") from None
+        raise OutputError(f"{folder}: cannot be written ({error.strerror or error})") from None
 
 
 def _append(path: Path, line: str) -> None:

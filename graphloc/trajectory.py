@@ -78,7 +78,10 @@ class Trajectory:
         right = np.clip(np.searchsorted(self.stamps_ns, stamps, side="left"), 1, len(self) - 1)
         gap = (self.stamps_ns[right] - self.stamps_ns[right - 1]) / 1e9
         inside = (stamps >= self.stamps_ns[0]) & (stamps <= self.stamps_ns[-1])
-        usual_s = float(np.quantile(np.diff(self.stamps_ns), 0.75)) / 1e9 if len(self) > 1 else 0.0
+        wide = gap > _MOST_APART_S
+        if not (inside & wide).any():
+            return np.asarray(inside)
+        usual_s = float(np.quantile(np.diff(self.stamps_ns), 0.75)) / 1e9
         return np.asarray(inside & (gap <= np.clip(_TIMES * usual_s, _MOST_APART_S, _SLOWEST_S)))
 
     def _around(self, stamps: NDArray[np.int64]) -> slice:

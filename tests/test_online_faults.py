@@ -191,13 +191,27 @@ def test_rates_in_degrees_are_waited_out() -> None:
     """To solve a start with them would take a minute, and leave nothing: it begins when the rates are right."""
     base, online = arrivals_of(run_of()), smoother(run_of())
     for a in base[: at_s(base, 7.0)]:
-        m = replace(a.m, gyro_radps=np.degrees(a.m.gyro_radps)) if isinstance(a.m, ImuSample) else a.m
+        m = replace(a.m, gyro_radps=40.0 * a.m.gyro_radps) if isinstance(a.m, ImuSample) else a.m
         assert online.feed(m) is None
     assert re.fullmatch(
         r"IMU data that a vessel can have: it rolls and pitches by \d+ deg within 5 s: rates in deg/s\?",
         online.waiting_for,
     )
     assert online.events() == []
+
+
+def test_a_recording_that_is_played_again_is_a_new_run() -> None:
+    """Its messages have come before: they were rejected as repeated, and the second round waited for a position for good."""
+    base = arrivals_of(run_of())
+    base = base[: at_s(base, 9.0)]
+    online = smoother(run_of())
+    rounds = []
+    for _ in range(2):
+        for a in base:
+            online.feed(a.m)
+        rounds.append(sum(e.text.startswith("started") for e in online.events()))
+        assert online.waiting_for == ""
+    assert rounds == [1, 1]
 
 
 def test_fixes_in_radians_are_waited_out() -> None:
@@ -260,6 +274,19 @@ def test_a_dead_imu_is_said_once_a_silence() -> None:
     for m in (*back, *again):
         online.feed(m)
     assert sum("no new pose until one comes" in e.text for e in online.events()) == 1
+
+
+def test_a_single_wrong_stamp_tells_no_dead_imu() -> None:
+    online, _ = begun(10.0)
+    base = arrivals_of(run_of())
+    samples = [a.m for a in base[at_s(base, 10.0) : at_s(base, 11.0)] if isinstance(a.m, ImuSample)]
+    heading = next(a.m for a in base[at_s(base, 10.0) :] if a.m.sensor == "compass")
+    for k, m in enumerate(samples):
+        online.feed(m)
+        if k == 20:
+            online.feed(heading)
+            online.feed(replace(heading, seq=10**6, stamp_ns=heading.stamp_ns + 3600 * 10**9))
+    assert not [e for e in online.events() if "no new pose" in e.text]
 
 
 def test_what_a_sensor_had_stored_tells_no_dead_imu() -> None:

@@ -12,7 +12,8 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from graphloc import outputs
-from graphloc.config import VesselConfig
+from graphloc.config import VesselConfig, parse_config
+from graphloc.factors import KINDS
 from graphloc.frames import Datum, Geodetic
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.solution import Cause, Health, HealthReason, SlowEstimate, Solution, SolveStats
@@ -186,3 +187,15 @@ def test_geojson_is_cut_at_the_date_line(tmp_path: Path) -> None:
     east[:, 0] += 360.0
     slope = np.diff(np.vstack([west, east[1:]])[:, :2], axis=0)
     np.testing.assert_allclose(slope[:, 1], slope[0, 1] / slope[0, 0] * slope[:, 0], atol=3e-9)  # it goes straight on
+
+
+def test_a_configuration_names_the_files_that_a_run_is_made_of() -> None:
+    """Of sensors that are switched on; each once."""
+    sensors = {
+        "quay": {"kind": "aerial", "image": "harbour.tif", "vector": "quays.geojson"},
+        "moored": {"kind": "aerial", "image": "other.tif", "enabled": False},
+        "tags": {"kind": "apriltag", "survey": "tags.yaml"},
+    }
+    raw = {"sensors": sensors, "truth_file": "truth.tum", "output": {"map_image": "harbour.tif"}}
+    config = parse_config({**raw, "datum": {"latitude_deg": 57.7, "longitude_deg": 11.9}}, KINDS, "vessel.yaml")
+    assert config.files == ("harbour.tif", "quays.geojson", "tags.yaml", "truth.tum")

@@ -235,6 +235,10 @@ def test_a_bag_with_its_configuration_varied(tmp_path: Path, monkeypatch: pytest
     (config.parent / "map.png").write_bytes(b"quay, rebuilt")
     with pytest.raises(OutputError, match="other versions or inputs"):
         sweep.sweep(jobs, tmp_path / "s")
+    (config.parent / "map.png").write_bytes(b"quay")
+    config.write_text(config.read_text() + "\n")
+    with pytest.raises(OutputError, match="other versions or inputs"):
+        sweep.sweep(jobs, tmp_path / "s")
     config.write_text(config.read_text().replace("truth_topic: /truth", ""))
     with pytest.raises(ConfigError, match="give --hold-out"):
         check(jobs)

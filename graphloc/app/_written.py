@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 from graphloc import found_tags, outputs
 from graphloc.app._run import Run, antennas
@@ -136,13 +137,13 @@ def write(
         OutputError: it is there already, or cannot be written.
     """
     folder = Path(folder)
-    data = report_data(run, command)
+    data, hashes = report_data(run, command), {str(p): sha256(p) for p in inputs}
     with fresh_folder(folder, overwrite=overwrite, mark=outputs.MARK) as fresh:
         outputs.write_run(
             fresh,
             run.solution,
             run.config.with_mounts(run.recording.mounts),
-            inputs={str(p): sha256(p) for p in inputs},
+            inputs=hashes,
             command=command,
             metrics={t.title: t.as_dict() for t in data.tables},
             warnings=run.warnings,
@@ -162,18 +163,29 @@ def write(
     return folder / "report.html"
 
 
-def inputs_of(bags: Sequence[Path], config_path: Path) -> tuple[Path, ...]:
-    """Return what a run was made of: bags, vessel.yaml, and the files that it names (images, surveys, truth)."""
-    named = load_config(config_path, KINDS).files
+def inputs_of(
+    bags: Sequence[Path], config_path: Path, changes: Mapping[str, object] = MappingProxyType({})
+) -> tuple[Path, ...]:
+    """Return what a run is made of: bags, vessel.yaml, and the files that it names (images, surveys, truth).
+
+    Args:
+        changes: of keys of vessel.yaml, as of `configured`.
+    """
+    named = load_config(config_path, KINDS, changes).files
     return *bags, config_path, *(config_path.parent / file for file in named)
 
 
 def sha256(path: Path) -> str:
-    """Return the hash of a file, or of all files of a folder in name order."""
+    """Return the hash of a file, or of all files of a folder in name order; of what cannot be read, why."""
+    if not path.exists():
+        return "no such file"
     digest = hashlib.sha256()
-    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
-    for file in files:
-        with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                digest.update(block)
+    try:
+        files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+        for file in files:
+            with file.open("rb") as stream:
+                while block := stream.read(1 << 20):
+                    digest.update(block)
+    except OSError as error:
+        return f"cannot be read ({error.strerror or error})"
     return digest.hexdigest()

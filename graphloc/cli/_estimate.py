@@ -67,12 +67,12 @@ def replay(
     """Run a bag through the online mode, as if live on board, and write the run folder."""
     from graphloc import app as application
 
-    options.check_outputs()
+    inputs = options.check_outputs()
     recording, vessel, scans = options.load(progress())
     run = application.replay_recording(recording, vessel, scans=scans, speed=speed, lag_s=lag, status=status_line())
     if sys.stderr.isatty():
         sys.stderr.write("\r\033[K")
-    options.write(run)
+    options.write(run, inputs)
 
 
 def stream(

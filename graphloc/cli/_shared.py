@@ -145,20 +145,22 @@ class RunOptions(FolderOptions):
     figures: FiguresOption = False
     rerun: RerunOption = None
 
-    def check_outputs(self) -> None:
-        """Refuse outputs that could not be written, before the run is solved.
+    def check_outputs(self) -> Sequence[Path]:
+        """Refuse outputs that could not be written, before the run is solved; return what the run is made of.
 
         Raises:
-            OutputError: one exists, or the disk refuses. ExtraError: rerun is not installed.
+            OutputError: one exists, or the disk refuses. ExtraError: rerun is not installed. ConfigError: vessel.yaml cannot be used.
         """
+        from graphloc import app as application
         from graphloc import outputs
 
         self.check(outputs.MARK)
         if self.rerun is not None:
             _check_rerun(self.rerun, self.overwrite)
+        return application.inputs_of(self.bag, self.config)
 
-    def write(self, run: Run) -> None:
-        """Write the run folder and the rerun recording, and print a summary of the run."""
+    def write(self, run: Run, inputs: Sequence[Path]) -> None:
+        """Write the run folder and the rerun recording, and print a summary of the run; `inputs`: what it is made of."""
         from graphloc import app as application
         from graphloc.eval import rerun_log
 
@@ -166,7 +168,7 @@ class RunOptions(FolderOptions):
         page = application.write(
             run,
             self.out,
-            inputs=application.inputs_of(self.bag, self.config),
+            inputs=inputs,
             command=command,
             overwrite=self.overwrite,
             figures=self.figures,
@@ -211,8 +213,8 @@ def smooth_bags(options: RunOptions, hold_out: str | None = None, *, compare: bo
     from graphloc.eval.holdout import HoldOut
 
     held = None if hold_out is None else HoldOut.parse(hold_out)
-    options.check_outputs()
+    inputs = options.check_outputs()
     show = progress()
     recording, vessel, scans = options.load(show)
     run = application.smooth_recording(recording, vessel, hold_out=held, compare=compare, scans=scans, progress=show)
-    options.write(run)
+    options.write(run, inputs)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -19,13 +20,15 @@ from graphloc.signals.imu_spikes import IMU_SPIKE, SpikeDetector
 from graphloc.time import NS_PER_S, stamps_of
 
 # The clock was set back where so many samples in a row lie before the newest: by more than a gap, as they may be sent again; or in
-# order, among those in use where none is missing, with other readings. A clock that is set back by less catches up before.
-_BACK, _AMONG = 50, 10
+# order, among those in use where none is missing, with other readings, by so much. A driver that stamps a batch back from the time at
+# which it was read overlaps the batch before by less.
+_BACK, _AMONG, _AMONG_S = 50, 10, 0.15
 _LATE_S = 3.0  # how late samples may come before the start
 _HOLE = 0.7  # share of the IMU's period: where no sample lies so near to either side, one is missing
 _FORCE_MPS2, _RATE_RADPS = (2.0, 100.0), 10.0  # limits for a vessel; readings in g or deg/s fall outside
 _BEHIND, _LOST = "its stamp does not increase", "held back as it leapt, and then the clock was set back"
-_SILENT_S = 3.0  # for which another sensor goes on without a sample: the IMU, or its driver, is dead
+# For so long, and so many messages, another sensor goes on without a sample: the IMU, or its driver, is dead; one stamp may be wrong.
+_SILENT_S, _TWICE = 3.0, 2
 _PERIODS = 1000  # newest steps between samples, from which the IMU's period is taken
 
 
@@ -106,8 +109,9 @@ class ImuIntake:
         self._frozen, self._spikes = FrozenImuDetector(), SpikeDetector()
         self._spiked = False
         self._stamps: list[int] = []  # of the samples in use, in order, as far back as a late one may lie
-        self._readings: dict[int, bytes] = {}  # of the newest samples in use, by stamp
-        self._since: dict[str, int] = {}  # by sensor, the first stamp that came since the last sample
+        self._readings: dict[int, bytes] = {}  # of these samples
+        self._since: dict[str, int] = {}  # by sensor, the least stamp that came since the last sample
+        self._went_on: Counter[str] = Counter()  # by sensor, its messages in a row that came so long after that
         self._told_silent = False
 
     def accept(self, m: ImuSample) -> float:
@@ -116,26 +120,31 @@ class ImuIntake:
         self._row = _Row()
         self._stamps.append(m.stamp_ns)
         self._readings[m.stamp_ns] = m.accel_mps2.tobytes()
-        if len(self._readings) > _PERIODS:
-            del self._readings[next(iter(self._readings))]
         return 0.0 if before is None else (m.stamp_ns - before.stamp_ns) * 1e-9
 
     def restart(self, stamps_ns: list[int]) -> None:
         """Replace the stamps of the samples in use."""
         self._stamps = stamps_ns
+        self._readings = {ns: self._readings[ns] for ns in stamps_ns if ns in self._readings}
 
     def forget(self, before_ns: int) -> None:
         """Forget older stamps."""
-        del self._stamps[: bisect_left(self._stamps, before_ns)]
+        n = bisect_left(self._stamps, before_ns)
+        for stamp_ns in self._stamps[:n]:
+            self._readings.pop(stamp_ns, None)
+        del self._stamps[:n]
 
     def silent_s(self, m: Measurement) -> float:
         """Return, once in a silence of the IMU, for how long (s) another sensor has gone on without it; else 0.
 
         A sensor whose clock is ahead, or that sends what it has stored, has not.
         """
-        went_on_ns = m.stamp_ns - self._since.setdefault(m.sensor, m.stamp_ns)
+        since_ns = self._since[m.sensor] = min(self._since.get(m.sensor, m.stamp_ns), m.stamp_ns)
         ahead_ns = 0 if self.newest is None else m.stamp_ns - self.newest.stamp_ns
-        if self._told_silent or min(went_on_ns, ahead_ns) < _SILENT_S * NS_PER_S:
+        went_on_ns = m.stamp_ns - since_ns
+        goes_on = min(went_on_ns, ahead_ns) >= _SILENT_S * NS_PER_S
+        self._went_on[m.sensor] = self._went_on[m.sensor] + 1 if goes_on else 0
+        if self._told_silent or self._went_on[m.sensor] < _TWICE:
             return 0.0
         self._told_silent = True
         return went_on_ns / NS_PER_S
@@ -143,6 +152,7 @@ class ImuIntake:
     def take(self, m: ImuSample, *, started: bool) -> Taken:
         """Decide on a sample, and on those that are held back; `started`: whether there is an estimate."""
         self._since.clear()
+        self._went_on.clear()
         self._told_silent = False
         if self.newest is not None and self.newest.stamp_ns < m.stamp_ns <= self._spikes.held_ns:
             return Taken(dropped=((m, _BEHIND),))
@@ -209,14 +219,15 @@ class ImuIntake:
         back_ns = newest.stamp_ns - m.stamp_ns
         again = self._readings.get(m.stamp_ns) == m.accel_mps2.tobytes()
         row = self._row = self._row.with_sample(
-            m.stamp_ns, back_ns, far=back_ns > self._gap_ns, among=n > 0 and not missing and not again
+            m.stamp_ns, back_ns, far=not missing and back_ns > self._gap_ns, among=n > 0 and not missing and not again
         )
-        if row.far >= _BACK or row.among >= _AMONG:
+        if row.far >= _BACK or (row.among >= _AMONG and row.back_ns >= _AMONG_S * NS_PER_S):
             self.newest = None
             return Taken(accepted=(m,), set_back_s=row.back_ns * 1e-9)
         # Before the start no period is known.
         if missing or (not started and apart_ns > 0 and back_ns < _LATE_S * 1e9):
             hole = (stamps[n - 1], stamps[n]) if n > 0 else None
             stamps.insert(n, m.stamp_ns)
+            self._readings[m.stamp_ns] = m.accel_mps2.tobytes()
             return Taken(late=m, hole=hole)
         return Taken(dropped=((m, _BEHIND),))

@@ -26,7 +26,7 @@ _STEADY = 0.75  # share of the measurements before that must have come with the 
 # Least change of the delay from one message to the next: where messages wait longer and longer, each waits at most
 # `_UNEVEN` of `_SLOWEST_S` longer than the one before.
 _AT_ONCE_S = 0.75
-_PAST_S = 10.0  # behind the IMU all the time: older than the usual lag, of no use
+_STEADILY_S = 1.0  # what was held up on its way catches up with the IMU by more
 _FUTURE_S = 3.0  # ahead of the IMU all the time: no message is so much faster
 
 
@@ -69,13 +69,17 @@ class SensorClock:
         """Return a measurement with its stamp corrected by `set_ns`."""
         return replace(m, stamp_ns=m.stamp_ns - self.set_ns) if self.set_ns else m
 
-    def take(self, m: Measurement, imu_ns: int) -> PutRight:
-        """Take in a measurement that has arrived; `imu_ns`: stamp of the newest IMU sample by then."""
+    def take(self, m: Measurement, imu_ns: int, lag_s: float = 10.0) -> PutRight:
+        """Take in a measurement that has arrived.
+
+        Args:
+            imu_ns: stamp of the newest IMU sample by then. lag_s: what is older cannot be used.
+        """
         m = self.right(m)
         ahead_ns, apart_ns, self._imu_ns = m.stamp_ns - imu_ns, imu_ns - self._imu_ns, imu_ns
         if len(self._ahead_ns) < _FEWEST:
             found = self._learn(m, ahead_ns, apart_ns)
-            return self._as_they_come(m) or PutRight(found, self._of_another_clock(m.sensor))
+            return self._as_they_come(m) or PutRight(found, self._of_another_clock(m.sensor, lag_s))
         before_ns = median(self._ahead_ns)
         by_ns = ahead_ns - round(before_ns)
         if abs(by_ns) < _SEEMS_S * NS_PER_S and not self._held:
@@ -114,17 +118,14 @@ class SensorClock:
         said = f"{m.sensor}: its clock was set again, unseen: its stamps are used as they come from {utc_text(m.stamp_ns)} on"
         return PutRight([*self._begin_anew(), m], said)
 
-    def _of_another_clock(self, sensor: str) -> str:
+    def _of_another_clock(self, sensor: str, lag_s: float) -> str:
         """Return a line for users, once, if all stamps are ahead of the IMU's, or far behind, while the IMU goes on; else empty."""
-        least_s, most_s, goes_on = (
-            min(self._ahead_ns) / NS_PER_S,
-            max(self._ahead_ns) / NS_PER_S,
-            median(self._apart_ns) > 0,
-        )
+        least_s, most_s = min(self._ahead_ns) / NS_PER_S, max(self._ahead_ns) / NS_PER_S
+        caught_up_s, goes_on = (self._ahead_ns[-1] - self._ahead_ns[0]) / NS_PER_S, median(self._apart_ns) > 0
         if (
             self._said
             or len(self._ahead_ns) < _FEWEST
-            or not (least_s >= _FUTURE_S or most_s <= -_PAST_S)
+            or not (least_s >= _FUTURE_S or (most_s <= -lag_s and caught_up_s < _STEADILY_S))
             or not goes_on
         ):
             return ""

@@ -46,6 +46,7 @@ from graphloc.trajectory import Trajectory
 log = logging.getLogger(__name__)
 _AGAIN_S = 6.0  # length of the data with which a lost estimate starts anew
 _AHEAD_S = 60.0  # by which a stamp may lie ahead of the IMU's: beyond, it is of another clock
+_MOST_REPEATS = 1000  # messages of a sensor: what is repeated later comes too late to be used, too
 _MOST_NAMES = 100  # unconfigured sensors of which it is said, once each, that they are ignored
 _NOT_REACHED = "the estimate restarted before IMU data reached its stamp"
 _NOT_ASKED = "its sensor is switched off or not in the configuration"
@@ -91,7 +92,7 @@ class OnlineSmoother:
         self._ledger = OnlineLedger(config)
         self._ignored: set[str] = set()  # names of sensors, said once
         self._events: list[Event] = []
-        self._repeats = {n: Repeats() for n in setup.measuring}
+        self._repeats = {n: Repeats(_MOST_REPEATS) for n in setup.measuring}
         self._thinnings = {n: Thinning(apart_ns) for n, apart_ns in setup.apart_ns.items()}
         self._intake = ImuIntake(setup.gap_s, imu is not None and imu.gravity != "removed")
         self._snapshot = SnapshotFile(snapshot)
@@ -200,7 +201,7 @@ class OnlineSmoother:
             self._say(
                 f"{newest.sensor}: no sample has come while {m.sensor} went on for {silent_s:.1f} s: no new pose until one comes"
             )
-        taken = self._persistent.clocks[m.sensor].take(m, newest.stamp_ns)
+        taken = self._persistent.clocks[m.sensor].take(m, newest.stamp_ns, self._setup.lag_s)
         self._say(taken.said)
         if taken.earlier_off_ns:
             self._put_right(m.sensor, taken.earlier_off_ns)
@@ -273,6 +274,8 @@ class OnlineSmoother:
         if taken.set_back_s:
             self._restart(f"the IMU's clock was set back by {taken.set_back_s:.1f} s")
             self._persistent.forget_clock(m.stamp_ns)
+            for repeats in self._repeats.values():
+                repeats.forget()
         made = None
         for sample in taken.accepted:
             made = self._accept_imu(sample) or made

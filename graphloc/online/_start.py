@@ -109,7 +109,8 @@ def try_start(
     span_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 if len(imu) else 0.0
     if span_s < LEAST_S:
         return f"{LEAST_S:g} s of IMU data"
-    if swing := swing_of_degrees(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps):
+    told = setup.imu is None or setup.imu.gyro_unit == "rad/s"  # else a user has said that they are as large
+    if told and span_s < _LONGEST_WAIT_S and (swing := swing_of_degrees(imu.stamps_ns, imu.accel_mps2, imu.gyro_radps)):
         return f"IMU data that a vessel can have: it rolls and pitches by {np.degrees(swing):.0f} deg within 5 s: rates in deg/s?"
     recording = Recording(
         source="(online)",
@@ -122,7 +123,8 @@ def try_start(
         return f"{_FIXES} GNSS fixes to set the origin, as no `datum:` is configured"
     try:
         datum = datum or origin.choose_datum(recording, config, setup.rows)
-        origin.refuse_far_fixes(recording, datum)
+        if config.datum is not None:
+            origin.refuse_far_fixes(recording, datum)
     except GraphlocError as error:
         return str(error)
     missing, told = _missing(setup, recording, datum, patient=span_s >= _LONGEST_WAIT_S)

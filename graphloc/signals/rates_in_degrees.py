@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.frames import Array
 
 _SWING_NS, _NO_SWING_RAD = 5_000_000_000, 1.5
+_WHOLE = 0.8  # least share of a window at the end: in a shorter one there is less swing
 _STEP_S = 0.2  # longest step over which rates are integrated
 _GRAVITY_S, _FEWEST_WINDOWS = 0.4, 10  # duration and least number of windows whose mean acceleration tells where up is
 _EXPLAINED = 0.75  # largest share of the motion of gravity's direction that rates in rad/s leave unexplained
@@ -58,6 +59,8 @@ def swing_of_degrees(stamps_ns: NDArray[np.int64], accel_mps2: Array, gyro_radps
     steps_s = np.minimum(np.diff(stamps_ns, prepend=stamps_ns[0]) * 1e-9, _STEP_S)
     angle = np.cumsum(level * steps_s[:, None], axis=0)
     begins = np.unique((stamps_ns - stamps_ns[0]) // _SWING_NS, return_index=True)[1]
+    if len(begins) > 1 and stamps_ns[-1] - stamps_ns[begins[-1]] < _WHOLE * _SWING_NS:
+        begins = begins[:-1]  # the rest belongs to the window before
     swings = np.maximum.reduceat(angle, begins) - np.minimum.reduceat(angle, begins)
     swing = float(np.median(np.linalg.norm(swings, axis=1)))
     return swing if swing > _NO_SWING_RAD and not turns_gravity(stamps_ns, accel_mps2, gyro_radps) else 0.0

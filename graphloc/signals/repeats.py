@@ -8,14 +8,21 @@ from collections.abc import Hashable
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, PoseFix
 
 REPEATED = "repeated message: same stamp, same value"
-_REMEMBERED = 1000  # messages; what is repeated later comes too late to be used, too
 
 
 class Repeats:
-    """Tells which of a sensor's measurements repeat the stamp and the value of an earlier one."""
+    """Tells which of a sensor's measurements repeat the stamp and the value of an earlier one.
 
-    def __init__(self) -> None:
-        self._seen: dict[Hashable, None] = {}
+    Args:
+        most: how many of the newest are remembered; None: all.
+    """
+
+    def __init__(self, most: int | None = None) -> None:
+        self._most, self._seen = most, dict[Hashable, None]()
+
+    def forget(self) -> None:
+        """Forget all: another clock may show the same stamps again."""
+        self._seen.clear()
 
     def repeats(self, stamp_ns: int, value: object) -> bool:
         """Return whether a measurement repeats an earlier one, and remember it."""
@@ -26,7 +33,7 @@ class Repeats:
         if key in self._seen:
             return True
         self._seen[key] = None
-        if len(self._seen) > _REMEMBERED:
+        if self._most is not None and len(self._seen) > self._most:
             del self._seen[next(iter(self._seen))]
         return False
 
