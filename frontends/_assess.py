@@ -18,7 +18,7 @@ from graphloc.frames import Array, Datum, Geodetic, wrap_angle
 from graphloc.frontends import _clock
 from graphloc.frontends._fixes import RTK_SIGMA_M, radians_warning, scatter_m, stored, stored_warning, uneven
 from graphloc.frontends._reports import GnssReport, PartOfFixes, TopicReport, Vec, of_nmea
-from graphloc.frontends._sanity import far_fixes_of
+from graphloc.frontends._sanity import far_fixes_of, lone_fixes
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import IMU, PLACES, UNSTAMPED
 from graphloc.measurements import GnssPosition, world_from_fixes
@@ -202,7 +202,7 @@ def on_one_clock(streams: Sequence[TopicData]) -> list[TopicData]:
 def track(fixes: TopicData) -> tuple[NDArray[np.int64], Array, Array]:
     """Return the stamps (N,) of good fixes, their positions (N, 3), m, about the first one, and their rows.
 
-    Left out are fixes of a stored position, and fixes far from all others. A fix without a height has the median height
+    Left out are fixes of a stored position, fixes far from all others, and single ones far from those around them. A fix without a height has the median height
     of the others, or 0 if none has one.
     """
     keep, rows = _placed(fixes)
@@ -213,7 +213,9 @@ def track(fixes: TopicData) -> tuple[NDArray[np.int64], Array, Array]:
     if len(keep) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), rows
     datum = Datum(Geodetic(*rows[0, :3]))
-    return fixes.stamps_ns[keep], datum.enu_from_geodetic(rows[:, 0], rows[:, 1], rows[:, 2]), rows
+    stamps_ns, p_m = fixes.stamps_ns[keep], datum.enu_from_geodetic(rows[:, 0], rows[:, 1], rows[:, 2])
+    near = ~lone_fixes(stamps_ns, p_m)
+    return stamps_ns[near], p_m[near], rows[near]
 
 
 def _placed(fixes: TopicData) -> tuple[NDArray[np.intp], Array]:

@@ -112,17 +112,18 @@ def _east_or_ahead(chords: Array, mean: Array) -> str | None:
     """Return which axes velocities have that fit as east, north and as body axes, of a craft that goes east or west.
 
     It is told by whether their y is the speed north; None if that is unclear. The errors of the two fits do not tell:
-    only east, north counts the wander of the fixes across the course.
+    only east, north counts the wander of the fixes across the course. Where the craft went north by more than the fixes
+    wander, y is as large: a log's leeway follows it as well.
 
     Args:
         chords: (N, 2), m/s. mean: (N, 3), m/s, means of the stream over the same times.
     """
     north, y, along = chords[:, 1], mean[:, 1], np.abs(mean[:, 0]) - np.hypot(*chords.T)
-    together = float(y @ north)
-    if together > _FOLLOWS * max(float(y @ y), float(np.sqrt((y @ y) * (north @ north)))):
+    together, square = float(y @ north), float(north @ north)
+    went = square > _NO_WANDER**2 * float(along @ along)
+    if together > _FOLLOWS * max(float(y @ y), float(np.sqrt((y @ y) * square)), square if went else 0.0):
         return EAST_AXES
-    # The craft went north by more than the fixes wander, and y does not show it.
-    return BODY_AXES if float(north @ north) > _NO_WANDER**2 * float(along @ along) else None
+    return BODY_AXES if went else None
 
 
 def _less(rms: float, noise: float) -> float:

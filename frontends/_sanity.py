@@ -25,6 +25,8 @@ NEVER_STILL_RADPS = 0.5
 HALF = "half an IMU, and both halves must come in one message (RealSense: unite_imu_method)"
 FAR_LEVER_M = 50.0
 """A sensor this far from the origin of body is on a ship, or its mount is not in metres."""
+# A single fix is wrong that is so far off those around it, in m, by an acceleration, and in distances between these two: choices
+LONE_M, _LONE_MPS2, _LONE_APART = 10.0, 20.0, 3.0
 _FEWEST = 100  # so many samples are not all 0 by chance
 _LEAST_RANGE_MPS2, _LEAST_RANGE_RADPS = 19.0, 1.7  # no IMU has a smaller range (2 g, 100 deg/s)
 # Fewer readings at the end of the range may be chance; the band beneath the end (a share of it) must hold no more.
@@ -201,6 +203,24 @@ def far_fixes_of(lla: Array) -> NDArray[np.bool_]:
     middle = Datum(Geodetic(float(np.median(lla[:, 0])), lon, float(np.median(lla[:, 2]))))
     enu = middle.enu_from_geodetic(lla[:, 0], lla[:, 1], lla[:, 2])
     return np.asarray(np.linalg.norm(enu, axis=1) > FAR_M)
+
+
+def lone_fixes(stamps_ns: NDArray[np.int64], p_m: Array) -> NDArray[np.bool_]:
+    """Return (N,) whether a fix lies so far off the line between the ones before and after it that no craft goes there and back.
+
+    Args:
+        stamps_ns: (N,), increasing. p_m: (N, 3).
+    """
+    alone = np.zeros(len(p_m), dtype=bool)
+    if len(p_m) < 3:
+        return alone
+    before_s, after_s = np.diff(stamps_ns)[:-1] / NS_PER_S, np.diff(stamps_ns)[1:] / NS_PER_S
+    share = (before_s / np.maximum(before_s + after_s, 1e-9))[:, None]
+    off_m = np.linalg.norm(p_m[1:-1] - (1.0 - share) * p_m[:-2] - share * p_m[2:], axis=1)
+    apart_m = np.linalg.norm(p_m[2:] - p_m[:-2], axis=1)
+    most_m = np.maximum(LONE_M, 0.5 * _LONE_MPS2 * before_s * after_s)
+    alone[1:-1] = off_m > np.maximum(most_m, _LONE_APART * apart_m)
+    return alone
 
 
 def far_fixes(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ from graphloc.eval.metrics import held_out_errors
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import SENSORS
 from graphloc.frames import Datum, Geodetic
+from graphloc.frontends._sanity import lone_fixes
 from graphloc.frontends.inspect import draft_config
 from graphloc.ledger import Outcome
 from graphloc.measurements import GnssPosition, PoseFix
@@ -386,3 +387,22 @@ def _flattened(m: GnssPosition) -> GnssPosition:
     return replace(
         m, position=m.position._replace(height_m=0.0), cov_enu_m2=np.diag([*np.diagonal(m.cov_enu_m2)[:2], 1e12])
     )
+
+
+@pytest.mark.parametrize(("hz", "least_m"), [(10.0, 10.0), (1.0, 31.0), (0.2, 300.0)])
+def test_single_fixes_to_which_no_craft_goes_and_comes_back_are_told(hz: float, least_m: float) -> None:
+    """A car of 15 m/s that brakes hard in 2 s, stands and sets out; wrong ones next to each other, at the ends, and jumps that last are not."""
+    t = np.arange(0.0, 300.0, 1.0 / hz)
+    speed = 15.0 * np.clip(np.abs((t % 60.0) - 30.0) / 2.0 - 1.0, 0.0, 1.0)
+    p = np.column_stack([np.cumsum(speed) / hz, 20.0 * np.sin(t / 7.0), 0.0 * t])
+    p[len(t) // 2 :] += [0.0, 80.0, 0.0]
+    wrong = np.arange(len(t) // 10, len(t) - 3, max(len(t) // 9, 4))
+    wrong = wrong[np.abs(wrong - len(t) // 2) > 2]
+    stamps_ns = START_NS + (t * S).astype(np.int64)
+    assert not lone_fixes(stamps_ns, p).any()
+    p[wrong, 1] += 1.2 * least_m + 3.0 * 2.0 * 15.0 / hz
+    assert np.flatnonzero(lone_fixes(stamps_ns, p)).tolist() == wrong.tolist()
+    p[0], p[-1] = [1e4, 0.0, 0.0], [1e4, 0.0, 0.0]
+    p[wrong + 1] = p[wrong]
+    assert not lone_fixes(stamps_ns, p).any()
+    assert not lone_fixes(stamps_ns[:2], p[:2]).any()

@@ -590,6 +590,19 @@ def test_a_way_east_tells_a_velocity_to_the_east_from_a_speed_ahead_if_at_all(
     assert report.axes == (EAST_AXES if axes == EITHER else axes)
 
 
+def test_a_log_that_makes_leeway_on_a_way_west_is_no_velocity_to_the_east() -> None:
+    """A log of the wrong sign: its speed ahead is that to the east, and its leeway goes with the speed to the north, a third as large."""
+    t = np.arange(80.0)
+    speed, course = 3.0 + np.sin(t / 8.0), np.radians(190.0)
+    leeway = np.radians(3.0)
+    way = np.cumsum(speed)[:, None] * [np.cos(course), np.sin(course), 0.0]
+    stream = TopicData("/vel", TWIST, "link")
+    for stamp, v in zip((START_NS + (t * S).astype(np.int64)).tolist(), speed.tolist(), strict=True):
+        stream.add(stamp, stamp, (-v * np.cos(leeway), -v * np.sin(leeway), 0.0), "run.db3")
+    told, why = axes_of(stream, ReferenceTrack(stream.stamps_ns, way, 0.01))
+    assert told == BODY_AXES, why
+
+
 @pytest.mark.parametrize(("topic", "knows_east"), [("/ins/odometry", False), ("/odometry", True), ("/odom", False)])
 def test_odometry_of_an_ins_is_no_wheels(topic: str, knows_east: bool, tmp_path: Path) -> None:
     """By its name, or as it knows where east is, it holds the fixes already: it was drafted as wheels to switch on."""

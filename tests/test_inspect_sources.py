@@ -547,6 +547,20 @@ def test_the_fix_of_a_base_ashore_is_not_the_vessels(tmp_path: Path) -> None:
     assert "a base station ashore" in text
 
 
+def test_a_receiver_of_which_single_fixes_are_wrong_is_this_crafts(tmp_path: Path) -> None:
+    """Each 30th is 3 km off: the IMU felt nothing of how it moved, so it was of another craft, and a receiver of metres was used."""
+    make = Messages(2)
+    items = drive(make, status=2, sigma_m=0.01, seconds=60)
+    cheap = [m for topic, _, m in drive(make, status=0, sigma_m=0.5, seconds=60, noise_m=0.3) if topic == "/fix"]
+    own = [(at, m) for topic, at, m in items if topic == "/fix"]
+    items += [("/cheap/fix", at, m) for (at, _), m in zip(own, cheap, strict=True)]
+    for _, m in own[15::30]:
+        m.latitude += 0.027
+    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    assert "of another craft" not in text
+    assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == ["/fix"]
+
+
 @pytest.mark.parametrize("moored", [False, True])
 def test_the_receiver_of_another_craft_is_not_the_vessels(moored: bool, tmp_path: Path) -> None:
     """A target's RTK, better than the own receiver, was taken for it. Where the IMU feels neither, as of a vessel that lies moored, a line says so."""

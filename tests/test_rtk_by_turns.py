@@ -9,10 +9,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
 
+import gtsam
 import numpy as np
 import pytest
 
-from graphloc import app
+from graphloc import app, keys
 from graphloc.build import rows_of, shared_constants
 from graphloc.config import GnssConfig, SensorConfig, SlowErrorConfig, VelocityConfig, VesselConfig
 from graphloc.eval.drill import script
@@ -27,7 +28,7 @@ from graphloc.measurements import GnssPosition, Measurement
 from graphloc.recording import Recording
 from graphloc.signals.frozen_receiver import FROZEN
 from graphloc.solution import Cause, Health, Solution
-from graphloc.solve._levels import _drawn_anew
+from graphloc.solve._levels import _drawn_anew, _moved, _Span
 from graphloc.trajectory import bounds_95
 from tests.bagfactory import S
 from tests.faults import arrivals_of, feed
@@ -382,3 +383,27 @@ def test_rtk_that_is_back_for_one_fix_a_little_before_the_state_it_is_carried_to
     )
     (span,) = _drawn_anew(case)
     assert span.gap_ns == (10 * S, 1996 * S // 100)
+
+
+@pytest.mark.parametrize("lost_again", [False, True])
+def test_another_level_after_an_outage_bends_the_track_and_steps_the_error(*, lost_again: bool) -> None:
+    """Silent from 3 to 8 s, and from 11 to 13 s: bent as the track is, the error jumped at each second, and 4 m were not found.
+
+    All fixes, which are the track less the error, stay met.
+    """
+    problem = SimpleNamespace(timeline=SimpleNamespace(stamps_ns=np.arange(16) * S, slow_stamps_ns=np.arange(16) * S))
+    values = gtsam.Values()
+    for k in range(16):
+        values.insert(keys.pose(k), gtsam.Pose3())
+        values.insert(keys.slow(0, k), np.zeros(3))
+    case: Any = SimpleNamespace(
+        streams=[SimpleNamespace(number=0)], problem=problem, settled=SimpleNamespace(values=values)
+    )
+    back = ((11 * S, 13 * S), (3, 11)) if lost_again else (None, (3,))
+    moved = _moved(case, np.array([4.0, 0.0, 0.0]), _Span((3 * S, 8 * S), 8 * S, None, 0, *back))
+    track = np.array([moved.atPose3(keys.pose(k)).translation()[0] for k in range(16)])
+    error = np.array([moved.atVector(keys.slow(0, k))[0] for k in range(16)])
+    assert np.flatnonzero(np.diff(error)).tolist() == list(back[1])
+    np.testing.assert_allclose(track[3:9], np.arange(6) * 0.8)
+    silent = [4, 5, 6, 7, *([12] if lost_again else [])]
+    np.testing.assert_allclose(np.delete(track - error, silent), 0.0, atol=1e-12)

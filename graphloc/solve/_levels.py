@@ -150,6 +150,7 @@ class _Span(NamedTuple):
             go on.
         back_ns: the next gap in which that stream's error is drawn anew, so that the level ends; None: there is none
             before the end of the run, or the errors go on.
+        anew: slow nodes after which that stream's error is drawn anew: in `gap_ns` and, if there is one, in `back_ns`.
     """
 
     gap_ns: tuple[int, int]
@@ -157,6 +158,7 @@ class _Span(NamedTuple):
     until_ns: int | None
     of: int | None = None
     back_ns: tuple[int, int] | None = None
+    anew: tuple[int, ...] = ()
 
 
 def _outages(case: _Case) -> list[_Span]:
@@ -176,9 +178,10 @@ def _drawn_anew(case: _Case) -> list[_Span]:
         stamps_ns = stamps_of(stream.measurements)
         back = np.searchsorted(case.problem.timeline.slow_of[stream.state], stream.anew, side="right")
         gaps: list[tuple[int, int] | None] = [(int(stamps_ns[n - 1]), int(stamps_ns[n])) for n in back]
-        for gap_ns, next_ns in pairwise([*gaps, None]):
+        for k, (gap_ns, next_ns) in enumerate(pairwise([*gaps, None])):
             assert gap_ns is not None
-            found.append(_Span(gap_ns, gap_ns[1], next_ns and next_ns[0], of=stream.number, back_ns=next_ns))
+            anew = tuple(stream.anew[k : k + 2].tolist())
+            found.append(_Span(gap_ns, gap_ns[1], next_ns and next_ns[0], of=stream.number, back_ns=next_ns, anew=anew))
     found = [span for span in found if case.levels(span)]
     longest = sorted(found, key=lambda span: span.gap_ns[1] - span.gap_ns[0])[-_MOST_OUTAGES:]
     return sorted(longest, key=lambda span: span.gap_ns)
@@ -293,7 +296,12 @@ def _moved(case: _Case, by_m: Array, span: _Span | None = None) -> gtsam.Values:
         pose = moved.atPose3(keys.pose(k))
         moved.update(keys.pose(k), gtsam.Pose3(pose.rotation(), pose.translation() + shift))
     for stream in case.streams:
-        for j, shift in enumerate(shifts(timeline.slow_stamps_ns)):
+        own = shifts(timeline.slow_stamps_ns)
+        if span is not None and stream.number == span.of:
+            # It steps where it is drawn anew: bent as the track is, it would step by some sigmas at each node across
+            # the outage, which looks like as many jumps.
+            own = np.outer(np.searchsorted(span.anew, np.arange(len(own))) == 1, by_m)
+        for j, shift in enumerate(own):
             key = keys.slow(stream.number, j)
             moved.update(key, moved.atVector(key) + shift)
     return moved
