@@ -63,7 +63,7 @@ def _jump(size_m: float) -> Change:
     return change
 
 
-def _velocity(craft: Craft, items: list[Item]) -> list[Item]:
+def velocity_of_receiver(craft: Craft, items: list[Item]) -> list[Item]:
     """A velocity from the receiver, beside its fixes."""
     t = craft.times(craft.odd.gnss_hz, 0.05)
     v = craft.motion.pose(t)[2] + 0.05 * craft.rng.normal(size=(len(t), 3))
@@ -80,7 +80,7 @@ def _hang(*topics: str) -> Change:
     """From 45 s on, for 20 s, these repeat what they said last."""
 
     def change(craft: Craft, items: list[Item]) -> list[Item]:
-        items = _velocity(craft, items) if "/gnss/vel" in topics else items
+        items = velocity_of_receiver(craft, items) if "/gnss/vel" in topics else items
         last: dict[str, Any] = {}
         for name, log_ns, m in sorted(items, key=lambda item: item[1]):
             if name not in topics:
@@ -130,7 +130,7 @@ def _rounded(_craft: Craft, items: list[Item]) -> list[Item]:
     return items
 
 
-def _no_covariance(_craft: Craft, items: list[Item]) -> list[Item]:
+def no_covariance(_craft: Craft, items: list[Item]) -> list[Item]:
     for name, _, m in items:
         if name == "/gnss/fix":
             m.position_covariance = np.full(9, np.nan)
@@ -244,7 +244,7 @@ CASES: dict[str, Odd] = {
         imu_rpy_deg=(180.0, 0.0, 0.0), accel=np.negative, draft=("gravity: inverted",)
     ),
     "IMU turned by 90 deg": Odd(imu_rpy_deg=(0.0, 0.0, 90.0), draft=(r"0.0, 0.0, 90.0\]",)),
-    "covariances NaN": Odd(change=_no_covariance),
+    "covariances NaN": Odd(change=no_covariance),
     "IMU stamps zero": Odd(change=_restamped(lambda k, ns: 0), draft=("stamps: recorded",)),
     "IMU stamps from boot": Odd(
         change=_restamped(lambda k, ns: ns - START_NS + 5 * 10**9), draft=("time_offset_s",)
@@ -347,18 +347,19 @@ def _walked(found: Found, odd: Odd, folder: Path) -> Found:
     config = app.configured(folder / "vessel.yaml")
     recording = read_recording(bag, config)
     run = app.smooth_recording(recording, config)
-    datum = app.choose_datum(run.recording, config)
+    found = replace(found, offline=judged(craft, run.solution))
+    return replace(found, online=judged(craft, replay(recording, config).solution))
 
-    def judged(solution: Solution) -> TruthMetrics:
-        t = np.arange(0.5, odd.seconds - 0.5, 0.05)
-        p, R, v = craft.motion.pose(t)
-        p = datum.enu_from_geodetic(*DATUM.geodetic_from_enu(p).T)
-        stamps_ns = np.array([stamp(at) for at in t])
-        truth = Trajectory(stamps_ns=stamps_ns, p_world_m=p, R_world_body=R, v_world_mps=v)
-        return compare_to_truth(solution.trajectory, truth)
 
-    found = replace(found, offline=judged(run.solution))
-    return replace(found, online=judged(replay(recording, config).solution))
+def judged(craft: Craft, solution: Solution) -> TruthMetrics:
+    """Return the errors of a track of a craft."""
+    t = np.arange(0.5, craft.odd.seconds - 0.5, 0.05)
+    p, R, v = craft.motion.pose(t)
+    p = solution.datum.enu_from_geodetic(*DATUM.geodetic_from_enu(p).T)
+    stamps_ns = np.array([stamp(at) for at in t])
+    return compare_to_truth(
+        solution.trajectory, Trajectory(stamps_ns=stamps_ns, p_world_m=p, R_world_body=R, v_world_mps=v)
+    )
 
 
 def figures(pool: ProcessPoolExecutor) -> list[Row]:

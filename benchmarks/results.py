@@ -23,6 +23,7 @@ import compass
 import dead_reckoning
 import docking
 import drawn
+import drawn_bags
 import drills
 import fuzz
 import harbours
@@ -50,6 +51,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "A.5": smoothing.outages,
     "A.6": smoothing.speed,
     "A.dev": compass.figures,
+    "A.drawn": drawn_bags.figures,
     "A.odd": odd.figures,
     "B.1": simulator.signals,
     "B.2": simulator.overlays,
