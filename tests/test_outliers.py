@@ -239,6 +239,12 @@ def test_jumps_of_decimetres_are_found_in_a_receiver_of_centimetres() -> None:
     assert not len(position_jumps(RTK_NS, *rtk(wrong, 0.015 + 0.5 * wrong), allowed_m=0.0)[0])
     late_ns = RTK_NS + 60_000_000 * (np.arange(len(t)) % 40 == 0)
     way, sigma_m = rtk(np.zeros(len(t)))
+    scattered = way.copy()
+    scattered[[100, 102]] += [
+        [300.0, 10.0],
+        [-40.0, 250.0],
+    ]  # two with a right one between them went there and back by other ways
+    assert not len(position_jumps(RTK_NS, scattered, sigma_m, allowed_m=0.0)[0])
     assert not len(position_jumps(late_ns, way, sigma_m, allowed_m=0.0)[0])
     assert not len(position_jumps(late_ns, way + np.outer(late_ns - RTK_NS, [20e-9, 0.0]), sigma_m, allowed_m=0.0)[0])
     waits_ns = RTK_NS + 80_000_000 * (t >= 30.0)  # one step takes longer: by its stamps, or in truth

@@ -33,6 +33,7 @@ _SIGMAS = 10.0  # least size in stated sigmas of a fix: less is its noise
 _BRAKES_MPS2 = 10.0  # emergency braking of a car to a stop between two fixes: a smaller difference is motion
 _EVEN = 1.5  # steps that last longer or shorter than usual by more than this factor are not compared
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
+_FAST_S = 0.25  # time between fixes up to which the motion within a second is even
 # Of `jumps_off_track`, which compares the medians of the fixes on either side of a jump.
 _BESIDE_S = 2.0  # length of either side
 _FEWEST_BESIDE = 3  # fixes on either side, at least, and so many of them off to that side: two outliers are no jump
@@ -105,7 +106,25 @@ def position_jumps(
     near = np.abs(np.subtract.outer(stamps_ns[far], stamps_ns[far])) <= _BURST_S * NS_PER_S
     back = np.linalg.norm(parts[far][:, None] + parts[far][None], axis=2) < off_m[far] / 2.0
     far = far[~(near & back).any(axis=1)]
+    if usual_s <= _FAST_S:
+        far = far[[_stays(places_m, int(n) + 2, float(off_m[n]), usual_s) for n in far]]
     return stamps_ns[far + 2], off_m[far]
+
+
+def _stays(places_m: Array, at: int, off_m: float, usual_s: float) -> bool:
+    """Return whether the places (N, 2) from index `at` on lie off those before, as after a jump of `off_m`.
+
+    Two outliers close to each other, with right fixes between them, look like a jump there and another one back by another way. The medians
+    of some fixes on either side are compared, less the usual motion between them.
+    """
+    n = max(round(_BURST_S / 2.0 / usual_s), _FEWEST_BESIDE)
+    before, after = places_m[max(at - n, 0) : at], places_m[at : at + n]
+    if min(len(before), len(after)) < _FEWEST_BESIDE:
+        return True
+    steps = np.diff(np.concatenate([before, after]), axis=0)
+    moved_m = np.median(steps, axis=0) * (len(before) + len(after)) / 2.0
+    change_m = np.median(after, axis=0) - np.median(before, axis=0) - moved_m
+    return bool(np.linalg.norm(change_m) > off_m / 2.0)
 
 
 def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: float) -> tuple[NDArray[np.int64], Array]:
