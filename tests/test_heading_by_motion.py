@@ -447,7 +447,7 @@ def test_online_a_check_of_the_heading_ends_no_guess_that_the_data_do_not(
     fails: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A check that fits, but a start with all that it looked at knows the heading no better: tried ever less often, a guess meanwhile."""
-    recording, config, *_ = robot(3, 45.0, speed_mps=8.0)
+    recording, config, *_ = robot(3, 48.0, speed_mps=8.0)
     tried_ns = list[int]()
 
     def denied(*given: Any) -> Any:

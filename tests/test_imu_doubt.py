@@ -19,6 +19,7 @@ from graphloc.eval.metrics import TrackErrors, errors
 from graphloc.factors.imu import ROW
 from graphloc.frames import Array
 from graphloc.inertial import GapMotion
+from graphloc.judge import wrong_imu
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSample, ImuSeries, Measurement
 from graphloc.online import _lag
@@ -27,7 +28,7 @@ from graphloc.online._lag import Lag
 from graphloc.online._tracking import Tracking
 from graphloc.recording import Recording, quiet
 from graphloc.solution import Health, Solution
-from graphloc.solve import _first_solution, wrong_imu
+from graphloc.solve import _first_solution
 from graphloc.solve._start import Begun
 from tests import test_online_faults as faults
 from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish

@@ -558,7 +558,14 @@ def test_memory_does_not_grow() -> None:
                 largest = early if t < 30.0 else late
                 for name, size in sizes(online).items():
                     largest[name] = max(size, largest.get(name, 0))
-    full = ("scatter._pairs", "scatter._squares", "scatter._bent", "heading_check._steps", "heading_check._fixes")
+    full = (
+        "scatter._pairs",
+        "scatter._squares",
+        "scatter._bent",
+        "heading_check._steps",
+        "heading_check._fixes.gnss",
+        "._seen",
+    )
     # fill up to their limit
     remembered = {name for name in early if name.endswith(full) or ".sensor_noise._pairs" in name}
     agreed = {name: size for name, size in late.items() if ".denials._agreed." in name}
@@ -568,7 +575,7 @@ def test_memory_does_not_grow() -> None:
     assert max(size for name, size in late.items() if ".sensor_noise._pairs" in name) <= 54
     # 40 s: at the 2.5 Hz of states, at the 2 Hz of fixes
     assert late["online._persistent.heading_check._steps"] <= 101
-    assert late["online._persistent.heading_check._fixes"] <= 83
+    assert late["online._persistent.heading_check._fixes.gnss"] <= 83
     grown = {n: (early.get(n, 0), s) for n, s in late.items() if n not in remembered and s > 1.15 * early.get(n, 0) + 5}
     assert len(early) > 30
     assert grown == {}
