@@ -358,6 +358,7 @@ def gnss_report(fixes: TopicData, tf_frame: str | None) -> GnssReport | None:
         roams_m=float(np.hypot(*np.subtract(*np.percentile(p[:, :2], [90, 10], axis=0)))),
         first=vec(rows[0, :3]),
         without_place=int((fixes.rows[sane(fixes), 3] >= 0).sum()) - len(every),
+        outliers=len(every) - int(old.sum()) - len(stamps),
         without_height=int(np.isnan(fixes.rows[every[np.isin(fixes.stamps_ns[every], stamps)], 2]).sum()),
         white_m=scatter_m(stamps[~bad], own[:, :2]),
         uneven=uneven(stamps[~bad], own),

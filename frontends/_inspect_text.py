@@ -172,6 +172,10 @@ def _gnss_lines(gnss: GnssReport) -> list[str]:
         lines.append(f"  not used: {gnss.elsewhere}")
     if gnss.without_place:
         lines.append(f"  {gnss.without_place} fixes lie at 0, 0, are NaN or beyond 90 and 180 deg, and are not used")
+    if gnss.outliers:
+        lines.append(
+            f"  {gnss.outliers} fixes lie so far off the others that no craft goes there and comes back; they are outliers"
+        )
     if gnss.without_height:
         lines.append(f"  {gnss.without_height} messages have no height (NaN) and are used as horizontal fixes")
     if gnss.reported_sigma_m is not None:

@@ -200,6 +200,7 @@ class GnssReport:
         in_radians: warning if its positions look like rad; else ''.
         wander: by how much its error changes along the way, by `wander_by`, wheels or a velocity; empty if unknown.
         without_place: number of fixes without a place: NaN, (0, 0), or beyond 90 and 180 deg.
+        outliers: number of fixes so far off the others that no craft goes there and comes back.
         without_height: number of fixes without a height. spans_s: time from its first fix to its last.
         late_s: what should be added to its stamps by the accelerometer, s, and 1 sigma; None if that is not clear.
         late_by: whose motion told so: its own, or that of a velocity of the same device.
@@ -235,6 +236,7 @@ class GnssReport:
     wander: tuple[Change, ...] = ()
     wander_by: str = ""
     without_place: int = 0
+    outliers: int = 0
     without_height: int = 0
     spans_s: float = 0.0
     late_s: tuple[float, float] | None = None

@@ -26,7 +26,7 @@ HALF = "half an IMU, and both halves must come in one message (RealSense: unite_
 FAR_LEVER_M = 50.0
 """A sensor this far from the origin of body is on a ship, or its mount is not in metres."""
 # A single fix is wrong that is so far off those around it, in m, by an acceleration, and in distances between these two: choices
-LONE_M, _LONE_MPS2, _LONE_APART = 10.0, 20.0, 3.0
+_LONE_M, _LONE_MPS2, _LONE_APART = 10.0, 20.0, 3.0
 _FEWEST = 100  # so many samples are not all 0 by chance
 _LEAST_RANGE_MPS2, _LEAST_RANGE_RADPS = 19.0, 1.7  # no IMU has a smaller range (2 g, 100 deg/s)
 # Fewer readings at the end of the range may be chance; the band beneath the end (a share of it) must hold no more.
@@ -218,7 +218,7 @@ def lone_fixes(stamps_ns: NDArray[np.int64], p_m: Array) -> NDArray[np.bool_]:
     share = (before_s / np.maximum(before_s + after_s, 1e-9))[:, None]
     off_m = np.linalg.norm(p_m[1:-1] - (1.0 - share) * p_m[:-2] - share * p_m[2:], axis=1)
     apart_m = np.linalg.norm(p_m[2:] - p_m[:-2], axis=1)
-    most_m = np.maximum(LONE_M, 0.5 * _LONE_MPS2 * before_s * after_s)
+    most_m = np.maximum(_LONE_M, 0.5 * _LONE_MPS2 * before_s * after_s)
     alone[1:-1] = off_m > np.maximum(most_m, _LONE_APART * apart_m)
     return alone
 

@@ -556,8 +556,9 @@ def test_a_receiver_of_which_single_fixes_are_wrong_is_this_crafts(tmp_path: Pat
     items += [("/cheap/fix", at, m) for (at, _), m in zip(own, cheap, strict=True)]
     for _, m in own[15::30]:
         m.latitude += 0.027
-    _, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
+    found, config, text = look(tmp_path, sorted(items, key=lambda item: item[1]), make)
     assert "of another craft" not in text
+    assert f"{len(own[15::30])} fixes lie so far off the others that no craft goes there" in render(found)
     assert [s.topic for s in config.of_kind("gnss").values() if s.enabled] == ["/fix"]
 
 
