@@ -106,6 +106,8 @@ class Reader:
                 value = decoder(msg, stamp_ns, seq, readings.sensor, readings.config)
             except (ValueError, ArithmeticError, AttributeError, TypeError) as error:
                 value = malformed(" ".join(str(error).split()))
+            if not isinstance(value, Decoded):  # another package's
+                value = malformed(f"its decoder returned {type(value).__name__}, no measurement")
         if not isinstance(value, Rejection):
             readings.add(seq, stamp_ns, raw.log_ns, value, raw.file)
         elif value.outcome is Outcome.MALFORMED:

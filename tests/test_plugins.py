@@ -141,6 +141,7 @@ def decode(msg, stamp_ns, seq, sensor, config):
 
 DECODERS = {"sensor_msgs/msg/Range": decode}
 LIST = [decode]
+NONE = {"sensor_msgs/msg/Range": lambda *_: None}
 """
 """A speed log in knots in a message that graphloc does not take for one."""
 
@@ -171,6 +172,14 @@ def test_a_package_may_add_a_message_of_its_own_to_a_kind_of_graphloc(
     bag, config = with_a_log(tmp_path, monkeypatch, "body_velocity", "DECODERS")
     told = [m.value for m in read_recording((bag,), config).measurements if isinstance(m, BodyVelocity)]
     np.testing.assert_allclose(told, np.full((20, 1), 1.852), rtol=1e-6)
+
+
+def test_a_decoder_that_returns_no_measurement_is_said_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was said that its messages tell nothing of the axes that are asked for."""
+    bag, config = with_a_log(tmp_path, monkeypatch, "body_velocity", "NONE")
+    rows = [row for row in read_recording((bag,), config).rows if row.sensor == "log"]
+    assert sum(row.count for row in rows) == 20
+    assert all("its decoder returned NoneType, no measurement" in row.reason for row in rows)
 
 
 def test_decoders_that_are_no_table_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
