@@ -8,26 +8,16 @@ axes, units, clocks, rates, claims, drift, outages, jumps. Nothing may be tuned 
 from __future__ import annotations
 
 import sys
-import tempfile
-import traceback
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
-from _odd_bags import Change, Craft, Item, Odd, stamp, written
+from _odd_bags import Change, Craft, Item, Odd, stamp
 from _rows import Row, row
-from odd import judged, no_covariance, velocity_of_receiver
+from odd import Found, no_covariance, off, restamped, velocity_of_receiver, walked
 from scipy.spatial.transform import Rotation
 
-from graphloc import app
-from graphloc.errors import GraphlocError
-from graphloc.eval import report
-from graphloc.eval.metrics import TruthMetrics
 from graphloc.frames import Array
-from graphloc.frontends.bag import read_recording
-from graphloc.frontends.inspect import draft_config, inspect_bag
 
 SEEDS = range(1300, 1348)
 _HONEST = 0.8  # share of the time inside the 95 % bounds, at the least
@@ -38,24 +28,6 @@ _RECEIVERS = {
     "sbas": (0.25, 0.6, 0.8, 1),
     "sps": (0.4, 1.5, 1.8, 0),
 }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Found:
-    """What came of a bag: how it was drawn, errors and whether the report trusts the track, offline; online; or why there is no track."""
-
-    drawn: str
-    offline: TruthMetrics | None = None
-    online: TruthMetrics | None = None
-    trusted: bool = False
-    trouble: str = ""
-    crashed: bool = False
-
-    def line(self) -> str:
-        cells = [f"{self.drawn:78}"]
-        for m in (self.offline, self.online):
-            cells.append("-" if m is None else f"{m.position_rmse_m:6.2f} m {100.0 * (m.coverage_95 or 0.0):4.0f} %")
-        return "  ".join([*cells, "trusted" if self.trusted else "", self.trouble])
 
 
 @dataclass(slots=True)
@@ -121,7 +93,7 @@ def _draw_clocks(found: _Drawn, rng: np.random.Generator) -> None:
         found.words.append(f"fixes {late_s:.2f} s late")
     if rng.uniform() < 0.25:
         boot_ns = int(rng.uniform(5.0, 5000.0) * 1e9) - stamp(0.0)
-        found.changes.append(_of_imu(lambda ns: ns + boot_ns))
+        found.changes.append(restamped(lambda _, ns: ns + boot_ns))
         found.words.append("IMU from boot")
 
 
@@ -139,19 +111,8 @@ def _draw_faults(found: _Drawn, rng: np.random.Generator) -> None:
         found.words.append(f"no fix for {lasts_s:.0f} s")
     elif rng.uniform() < 0.3:
         size_m = float(rng.uniform(2.0, 15.0))
-        found.changes.append(_off(size_m, middle_s, middle_s + float(rng.uniform(5.0, 20.0))))
+        found.changes.append(off(size_m, middle_s, middle_s + float(rng.uniform(5.0, 20.0))))
         found.words.append(f"off by {size_m:.0f} m")
-
-
-def _of_imu(stamped: Callable[[int], int]) -> Change:
-    def change(craft: Craft, items: list[Item]) -> list[Item]:
-        for name, _, m in items:
-            if name == "/imu/data":
-                own_ns = m.header.stamp.sec * 10**9 + m.header.stamp.nanosec
-                m.header = craft.make.header(stamped(own_ns), m.header.frame_id)
-        return items
-
-    return change
 
 
 def _silent(begin_s: float, end_s: float) -> Change:
@@ -164,40 +125,9 @@ def _silent(begin_s: float, end_s: float) -> Change:
     return change
 
 
-def _off(size_m: float, begin_s: float, end_s: float) -> Change:
-    """Fixes that lie off to the north-east for a while."""
-
-    def change(_craft: Craft, items: list[Item]) -> list[Item]:
-        for name, log_ns, m in items:
-            if name == "/gnss/fix" and stamp(begin_s) < log_ns < stamp(end_s):
-                m.latitude += 0.6 * size_m / 111e3
-                m.longitude += 0.8 * size_m / 111e3 / np.cos(np.radians(m.latitude))
-        return items
-
-    return change
-
-
 def measured(seed: int) -> Found:
     odd, words = drawn_bag(seed)
-    found = Found(drawn=f"{seed} {words}")
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            return _walked(found, odd, Path(folder))
-        except GraphlocError as error:
-            return replace(found, trouble=str(error)[:200])
-        except Exception:  # noqa: BLE001 - what no user may see
-            return replace(found, trouble=traceback.format_exc(), crashed=True)
-
-
-def _walked(found: Found, odd: Odd, folder: Path) -> Found:
-    bag, craft = written(odd, folder)
-    (folder / "vessel.yaml").write_text(draft_config(inspect_bag(bag)))
-    config = app.configured(folder / "vessel.yaml")
-    recording = read_recording(bag, config)
-    run = app.smooth_recording(recording, config)
-    (said,) = report.verdict(app.report_data(run)).tracks
-    found = replace(found, offline=judged(craft, run.solution), trusted=said.trust is report.Trust.YES)
-    return replace(found, online=judged(craft, app.replay_recording(recording, config).solution))
+    return walked(Found(name=f"{seed} {words}"), odd)
 
 
 def figures(pool: ProcessPoolExecutor) -> list[Row]:

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc import app
 from graphloc.errors import GraphlocError
+from graphloc.eval import report
 from graphloc.eval.metrics import TruthMetrics, compare_to_truth
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag
@@ -36,7 +37,7 @@ from graphloc.trajectory import Trajectory
 _HONEST = 0.85  # share of the time inside the 95 % bounds, at the least
 
 
-def _restamped(stamped: Callable[[int, int], int]) -> Change:
+def restamped(stamped: Callable[[int, int], int]) -> Change:
     """Other header stamps of the IMU; `stamped` takes the number of a message and its stamp, ns."""
 
     def change(craft: Craft, items: list[Item]) -> list[Item]:
@@ -49,16 +50,25 @@ def _restamped(stamped: Callable[[int, int], int]) -> Change:
     return change
 
 
+def off(size_m: float, begin_s: float, end_s: float) -> Change:
+    """Fixes that lie off to the north-east for a while."""
+
+    def change(_craft: Craft, items: list[Item]) -> list[Item]:
+        for name, log_ns, m in items:
+            if name == "/gnss/fix" and stamp(begin_s) < log_ns < stamp(end_s):
+                m.latitude += 0.6 * size_m / 111e3
+                m.longitude += 0.8 * size_m / 111e3 / np.cos(np.radians(m.latitude))
+        return items
+
+    return change
+
+
 def _jump(size_m: float) -> Change:
     """Fixes that are off for the middle third of the run."""
 
     def change(craft: Craft, items: list[Item]) -> list[Item]:
         third = craft.odd.seconds / 3.0
-        for name, log_ns, m in items:
-            if name == "/gnss/fix" and stamp(third) < log_ns < stamp(2.0 * third):
-                m.latitude += 0.6 * size_m / 111e3
-                m.longitude += 0.8 * size_m / 111e3 / np.cos(np.radians(m.latitude))
-        return items
+        return off(size_m, third, 2.0 * third)(craft, items)
 
     return change
 
@@ -245,12 +255,12 @@ CASES: dict[str, Odd] = {
     ),
     "IMU turned by 90 deg": Odd(imu_rpy_deg=(0.0, 0.0, 90.0), draft=(r"0.0, 0.0, 90.0\]",)),
     "covariances NaN": Odd(change=no_covariance),
-    "IMU stamps zero": Odd(change=_restamped(lambda k, ns: 0), draft=("stamps: recorded",)),
+    "IMU stamps zero": Odd(change=restamped(lambda k, ns: 0), draft=("stamps: recorded",)),
     "IMU stamps from boot": Odd(
-        change=_restamped(lambda k, ns: ns - START_NS + 5 * 10**9), draft=("time_offset_s",)
+        change=restamped(lambda k, ns: ns - START_NS + 5 * 10**9), draft=("time_offset_s",)
     ),
     "IMU in bursts of ten": Odd(
-        change=_restamped(lambda k, ns: stamp(0.09 + k // 10 / 10.0 + 5e-5 * (k % 10))), **_RTK
+        change=restamped(lambda k, ns: stamp(0.09 + k // 10 / 10.0 + 5e-5 * (k % 10))), **_RTK
     ),
     "IMU clock 800 ppm fast": Odd(seconds=300.0, imu_hz=50.0, gnss_hz=2.0, ppm=800.0, draft=("clock_drift_ppm: [78]",), **_RTK),
     "second receiver, faster and worse": Odd(
@@ -312,27 +322,36 @@ CASES: dict[str, Odd] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Found:
-    """What came of a bag: whether its draft is right, errors against the truth, or why there is no track."""
+    """What came of a bag: whether its draft is right, errors against the truth, or why there is no track.
+
+    Attributes:
+        trusted: whether the report says that its offline track can be trusted.
+    """
 
     name: str
     drafted: bool = False
     offline: TruthMetrics | None = None
     online: TruthMetrics | None = None
+    trusted: bool = False
     trouble: str = ""
     crashed: bool = False
 
     def line(self) -> str:
-        cells = [f"{self.name:42}", "right" if self.drafted else "WRONG"]
+        cells = [f"{self.name:42}", "right" if self.drafted else "WRONG", "trusted" if self.trusted else ""]
         for m in (self.offline, self.online):
             cells.append("-" if m is None else f"{m.position_rmse_m:6.2f} m {100.0 * (m.coverage_95 or 0.0):4.0f} %")
         return "  ".join([*cells, self.trouble])
 
 
 def measured(name: str) -> Found:
-    found = Found(name=name)
+    return walked(Found(name=name), CASES[name])
+
+
+def walked(found: Found, odd: Odd) -> Found:
+    """Return what is known of a bag, with what came of it by the user's path."""
     with tempfile.TemporaryDirectory() as folder:
         try:
-            return _walked(found, CASES[name], Path(folder))
+            return _walked(found, odd, Path(folder))
         except GraphlocError as error:
             return replace(found, trouble=str(error)[:200])
         except Exception:  # noqa: BLE001 - what no user may see
@@ -347,11 +366,12 @@ def _walked(found: Found, odd: Odd, folder: Path) -> Found:
     config = app.configured(folder / "vessel.yaml")
     recording = read_recording(bag, config)
     run = app.smooth_recording(recording, config)
-    found = replace(found, offline=judged(craft, run.solution))
-    return replace(found, online=judged(craft, replay(recording, config).solution))
+    (said,) = report.verdict(app.report_data(run)).tracks
+    found = replace(found, offline=_judged(craft, run.solution), trusted=said.trust is report.Trust.YES)
+    return replace(found, online=_judged(craft, replay(recording, config).solution))
 
 
-def judged(craft: Craft, solution: Solution) -> TruthMetrics:
+def _judged(craft: Craft, solution: Solution) -> TruthMetrics:
     """Return the errors of a track of a craft."""
     t = np.arange(0.5, craft.odd.seconds - 0.5, 0.05)
     p, R, v = craft.motion.pose(t)
