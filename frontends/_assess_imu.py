@@ -50,6 +50,7 @@ _QUIET_S, _STANDS_S = 2, 1.5
 _TILTED_DEG, _QUARTER_DEG, _OVERRULES = 20.0, 20.0, 0.6
 _SLIGHTLY_DEG = 3.0  # deviation from a multiple of 90 deg from which it is said
 _ASKEW_DEG = 15.0  # deviation from which an IMU sits askew: leeway, or an antenna far ahead, make less
+_EITHER = 0.5**0.5  # 1 sigma about one of two angles that are as likely, by how far they are apart
 _AHEAD_DEG = 60.0  # yaw within which an unclear motion says that x is ahead rather than astern or aside
 _CAMERA = -0.7  # z component of y, levelled, below which the axes are a camera's (y down)
 _ON_ITS_HEAD = -0.7  # z component of the upward axis below which a sensor is upside down, however it is tilted
@@ -145,7 +146,7 @@ def _measured_mount(samples: _Samples, motions: Sequence[MeasuredMotion]) -> Mou
     turn = rotation_from_rpy_deg(np.array(mount.rpy_deg)) @ level.T
     roll, pitch, yaw = np.degrees(rpy_from_rotation(turn @ _level(axis))).tolist()
     square = f"drafted in steps of 90 deg: if the sensor is tilted in the craft, rather than the craft itself, set [{roll:.1f}, {pitch:.1f}, {yaw:.1f}]"
-    return replace(mount, evidence=f"{mount.evidence}; {square}")
+    return replace(mount, evidence=f"{mount.evidence}; {square}", tilt_sigma_deg=off_deg * _EITHER)
 
 
 def _tilt_deg(R_body_imu: Array, accel: Array) -> float:
@@ -243,26 +244,26 @@ def _level(axis: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(angle * cross / sine).as_matrix() @ turned)
 
 
-def _mount_yaw(levelled: _Samples, motions: Sequence[MeasuredMotion]) -> tuple[float | None, float | None, str]:
+def _mount_yaw(levelled: _Samples, motions: Sequence[MeasuredMotion]) -> tuple[float | None, float, str]:
     """Return the yaw of a levelled IMU by the motion, its sigma, and the evidence in words.
 
     Returns:
         The yaw, deg: a multiple of 90 unless the motion clearly contradicts it; None where nothing tells it. Its 1
-        sigma, deg, if it may be no multiple of 90; else None. The evidence.
+        sigma, deg, if it may be no multiple of 90; else 0. The evidence.
     """
     if not motions:
-        return None, None, "no motion to find its yaw from"
+        return None, 0.0, "no motion to find its yaw from"
     found = yaw_in_craft(levelled.stamps_ns, levelled.accel, levelled.gyro, motions)
     if found is None:
-        return None, None, "too little motion to find its yaw from"
+        return None, 0.0, "too little motion to find its yaw from"
     quarter = 90.0 * round(found.yaw_deg / 90.0)
     stays = found.hints and abs(found.yaw_deg) < _AHEAD_DEG
     if not found.clear and (found.likely or stays):
         yaw = float(np.degrees(wrap_angle(np.radians(quarter)))) + 0.0 if found.likely else 0.0
         said = f"yaw by the motion of {found.source}: {found.yaw_deg:z.0f} deg, but not clearly (coherence {found.coherence:.2f})"
-        return yaw, None, f"{said}: taken as {yaw:.0f}"
+        return yaw, 0.0, f"{said}: taken as {yaw:.0f}"
     if not found.clear:
-        return None, None, f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
+        return None, 0.0, f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
     off_deg = abs(found.yaw_deg - quarter)
     turned = off_deg > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
     askew = turned and not found.one_way
@@ -273,13 +274,11 @@ def _mount_yaw(levelled: _Samples, motions: Sequence[MeasuredMotion]) -> tuple[f
             f", taken as {yaw:.0f}: she goes one way, so leeway or a current may set her by that; where she is not set sideways, as "
             f"on wheels, set {found.yaw_deg:.0f}"
         )
-        return yaw, off_deg / float(np.sqrt(2.0)), said  # either is as likely
+        return yaw, off_deg * _EITHER, said
     if not askew and off_deg > max(_SLIGHTLY_DEG, 4.0 * found.sigma_deg):
-        said += (
-            f", taken as {yaw:.0f}, since leeway makes a few degrees: on wheels set {found.yaw_deg:.0f}, or the heading is off by "
-            f"{off_deg:.0f} deg, which no bound includes"
-        )
-    return yaw, found.error_deg if askew else None, said
+        said += f", taken as {yaw:.0f}, since leeway makes a few degrees: where she is not set sideways, as on wheels, set {found.yaw_deg:.0f}"
+        return yaw, off_deg * _EITHER, said
+    return yaw, found.error_deg if askew else 0.0, said
 
 
 class Inertial(NamedTuple):

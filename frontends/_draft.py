@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from graphloc.config import CompassConfig, ImuConfig
 from graphloc.frontends._draft_clock import with_clock
@@ -166,13 +167,14 @@ def _imu_block(name: str, imu: ImuReport, *, enabled: bool) -> list[str]:
 
 
 def _mount_sigma_lines(mount: MountGuess) -> list[str]:
-    """Return the mount's sigma if its yaw is no multiple of 90 deg: motion often tells it worse than the default."""
-    default = ImuConfig().mount_sigma_deg
-    if mount.tf_frame is not None or mount.yaw_sigma_deg is None:
+    """Return the mount's sigmas where gravity and the motion leave more open than the default."""
+    beyond = np.array([mount.tilt_sigma_deg, mount.tilt_sigma_deg, mount.yaw_sigma_deg])
+    if mount.tf_frame is not None or not beyond.any():
         return []
-    sigma = math.hypot(default, mount.yaw_sigma_deg)
+    known = np.degrees(ImuConfig().mount_sigma_rad)
+    sigmas = ", ".join(f"{sigma:.1f}" for sigma in np.hypot(known, beyond))
     return [
-        f"  mount_sigma_deg: {sigma:.1f}  # guess: as well as the motion tells that yaw; {default:g} once it is measured"
+        f"  mount_sigma_deg: [{sigmas}]  # guess: what gravity and the motion leave open; {known[0]:g} once it is measured"
     ]
 
 

@@ -112,8 +112,8 @@ class MountGuess:
     Attributes:
         rpy_deg: roll, pitch, yaw. tf_frame: frame of tf that tells the mount; None if it is not from tf.
         evidence: in words. xyz_m: its position; None if unknown.
-        yaw_told: whether anything tells its yaw. yaw_sigma_deg: 1 sigma of a yaw that may be no multiple of 90 deg;
-            else None.
+        yaw_told: whether anything tells its yaw.
+        tilt_sigma_deg, yaw_sigma_deg: 1 sigma of roll and pitch each, and of yaw, beyond that of a mount that is known.
     """
 
     rpy_deg: Vec
@@ -121,7 +121,8 @@ class MountGuess:
     evidence: str
     xyz_m: Vec | None = None
     yaw_told: bool = True
-    yaw_sigma_deg: float | None = None
+    tilt_sigma_deg: float = 0.0
+    yaw_sigma_deg: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

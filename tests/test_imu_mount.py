@@ -130,6 +130,24 @@ def test_fixes_alone_do_not_tell_it() -> None:
     assert -1.6 < heading.min() < heading.max() < -0.3  # the lever arm holds some of it
 
 
+def test_axes_of_the_mount_have_sigmas_of_their_own(simulated: SimulatedRun) -> None:
+    """What a heading of known mount tells of the yaw is the same; a sigma of 0 leaves an axis as it is, in the bounds, too."""
+    _, result = with_result(gnss_compass(askew(simulated)))
+
+    def of(*sigmas_deg: float) -> MountError:
+        config = changed(result.problem.config, "imu", mount_sigma_deg=sigmas_deg)
+        return error_of(replace(result, problem=replace(result.problem, config=config)))
+
+    level, wide, known = of(0.0, 0.0, 1.0), of(2.0, 0.5, 1.0), of(2.0, 0.5, 0.0)
+    assert np.degrees(np.sqrt(wide.mean_square[:2])) == pytest.approx([2.0, 0.5])
+    assert not level.mean_square[:2].any()
+    assert (known.yaw_rad, known.sigma_rad, known.mean_square[2]) == (0.0, 0.0, 0.0)
+    assert level.sigma_rad == pytest.approx(wide.sigma_rad, rel=0.2)
+    R, up = np.eye(3)[None].repeat(len(level.pose), axis=0), np.array([0.0, 0.0, 5.0])
+    narrow, broad = (error.pose_covariance(R, up)[:, 3:5, 3:5] for error in (level, wide))
+    assert narrow.max() < 0.01 * np.trace(broad, axis1=1, axis2=2).min()
+
+
 def test_states_follow_the_mount_as_reckoned(simulated: SimulatedRun) -> None:
     """By solving again with an IMU that is turned the other way, taken as given."""
     turn = np.radians([0.05, -0.08, 0.1])
@@ -150,11 +168,12 @@ def test_states_follow_the_mount_as_reckoned(simulated: SimulatedRun) -> None:
 def test_online_the_newest_state_follows_the_mount_as_its_bounds_say(simulated: SimulatedRun) -> None:
     """Turned by a bit of its sigma about each axis in turn, the IMU moves place, heading and velocity by as much of what they are widened by."""
     share = 0.2
-    simulated = slowly(simulated)
-    as_given, widened = (replay(r.recording, r.config).solution for r in (taken_as_given(simulated), simulated))
+    simulated, sigmas_deg = slowly(simulated), (0.5, 1.0, 2.0)
+    unsure = replace(simulated, config=changed(simulated.config, "imu", mount_sigma_deg=sigmas_deg))
+    as_given, widened = (replay(r.recording, r.config).solution for r in (taken_as_given(simulated), unsure))
     track = as_given.trajectory
     moved = []
-    for axis in np.eye(3):
+    for axis in np.diag(sigmas_deg):
         run = taken_as_given(askew(simulated, tuple(share * axis)))
         other = replay(run.recording, run.config).solution.trajectory
         off = other.p_world_m[-1] - track.p_world_m[-1], wrap_angle(other.yaw_rad - track.yaw_rad)[-1:]

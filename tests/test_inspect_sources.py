@@ -181,9 +181,11 @@ def test_a_yaw_by_the_motion_is_drafted_as_well_as_waves_let_it_be_known(
     assert isinstance(imu, ImuConfig)
     off_deg = abs(imu.mount.rpy_deg[2] - yaw_deg)
     if yaw_deg == 90.0:  # a quarter turn is exact
-        assert (off_deg, imu.mount_sigma_deg) == (0.0, ImuConfig().mount_sigma_deg)
+        assert off_deg == 0.0
+        assert np.degrees(imu.mount_sigma_rad[2]) < 3.0
     else:
-        assert 2.0 < off_deg < 2.0 * imu.mount_sigma_deg
+        assert 2.0 < off_deg < 2.0 * np.degrees(imu.mount_sigma_rad[2])
+        assert np.degrees(imu.mount_sigma_rad[:2]) == pytest.approx(1.0)
 
 
 def test_a_yaw_that_windows_of_other_lengths_have_elsewhere_is_not_clear(tmp_path: Path) -> None:
@@ -232,19 +234,39 @@ def test_a_course_that_goes_one_way_tells_no_angle_of_imu_or_compass(tmp_path: P
         assert compass.mount.rpy_deg[2] == pytest.approx(yaw_deg, abs=2.0)
         assert ("she goes one way, so leeway or a current may set her by that" in text) == set_sideways
         if set_sideways:  # what no course tells is in the bounds
-            assert 1.96 * imu.mount_sigma_deg > 27.0
+            assert 1.96 * np.degrees(imu.mount_sigma_rad[2]) > 27.0
             assert 1.96 * compass.mount_offset_sigma_deg > 27.0
         else:
-            assert imu.mount_sigma_deg < 5.0
+            assert np.degrees(imu.mount_sigma_rad[2]) < 5.0
 
 
 @pytest.mark.parametrize(("yaw_deg", "said"), [(0.0, False), (-84.0, True)])
 def test_an_imu_that_sits_a_little_askew_is_said(yaw_deg: float, said: bool, tmp_path: Path) -> None:
-    """Drafted as a quarter turn, since leeway would look alike; nothing said that the heading is off by the rest."""
+    """Drafted as a quarter turn, since leeway would look alike, in bounds that hold both: the heading was off by the rest, and no bound included it."""
     make = Messages(2)
     _, config, text = look(tmp_path, drive(make, rotation_z(yaw_deg), seconds=90), make)
-    assert config.sensors["imu"].mount.rpy_deg[2] == pytest.approx(90.0 * round(yaw_deg / 90.0))
-    assert ("on wheels set -84, or the heading is off by 6 deg" in text) == said
+    imu = config.sensors["imu"]
+    assert isinstance(imu, ImuConfig)
+    assert imu.mount.rpy_deg[2] == pytest.approx(90.0 * round(yaw_deg / 90.0))
+    assert ("where she is not set sideways, as on wheels, set -84" in text) == said
+    if said:
+        assert 1.96 * np.degrees(imu.mount_sigma_rad[2]) > 6.0
+    else:
+        assert imu.mount_sigma_deg == ImuConfig().mount_sigma_deg
+
+
+@pytest.mark.parametrize(("pitch_deg", "wide"), [(1.0, False), (8.0, True)])
+def test_an_imu_that_is_tilted_a_little_is_in_the_bounds(pitch_deg: float, wide: bool, tmp_path: Path) -> None:
+    """Drafted level, since the craft may be trimmed as much: roll and pitch were off by that, in bounds of 2 deg."""
+    make, c, s = Messages(2), np.cos(np.radians(pitch_deg)), np.sin(np.radians(pitch_deg))
+    _, config, text = look(tmp_path, drive(make, np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])), make)
+    imu = config.sensors["imu"]
+    assert isinstance(imu, ImuConfig)
+    assert imu.mount.rpy_deg == (0.0, 0.0, 0.0)
+    sigmas_deg = np.degrees(imu.mount_sigma_rad)
+    assert (1.96 * sigmas_deg[:2] > pitch_deg).all()
+    assert (sigmas_deg[0] > 2.0) == wide == ("if the sensor is tilted in the craft" in text)
+    assert sigmas_deg[2] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("yaw_deg", [40.0, 180.0])

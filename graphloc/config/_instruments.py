@@ -14,6 +14,7 @@ from pydantic import Field, field_validator
 
 from graphloc.blocks import Block, Finite, NonNegative, Positive
 from graphloc.config._sensor import KernelConfig, SensorConfig
+from graphloc.frames import Array
 from graphloc.signals.thinning import LEAST_APART_NS
 
 STANDARD_GRAVITY_MPS2 = 9.80665
@@ -45,9 +46,9 @@ class ImuConfig(SensorConfig):
     """Turn-on accelerometer bias, 1 sigma, mg."""
     gyro_bias_sigma_dps: Positive = 2.0
     """Turn-on gyroscope bias, 1 sigma, deg/s, before the start alignment has measured it."""
-    mount_sigma_deg: NonNegative = 1.0
-    """Unknown attitude error of its mount, 1 sigma, each axis, deg. Offline its yaw is estimated with the run, and the bounds include
-    what is left of it. 0: the IMU's axes are those of the vessel by definition, or were calibrated to a tenth of a degree."""
+    mount_sigma_deg: NonNegative | tuple[NonNegative, NonNegative, NonNegative] = 1.0
+    """Unknown attitude error of its mount, 1 sigma, deg: of each axis, or [roll, pitch, yaw]. Offline its yaw is estimated with the run, and
+    the bounds include what is left of it. 0: the IMU's axes are those of the vessel by definition, or were calibrated to a tenth of a degree."""
     adapt_noise: bool = True
     """Raise the noise (never lower it, and with a warning) if the run contradicts it, or the IMU's own residuals do; and the walk of
     the biases, if they go farther than they may."""
@@ -59,9 +60,9 @@ class ImuConfig(SensorConfig):
     """Robust loss: not used for inertial data."""
 
     @property
-    def mount_sigma_rad(self) -> float:
-        """Attitude error of the mount, 1 sigma, rad."""
-        return float(np.radians(self.mount_sigma_deg))
+    def mount_sigma_rad(self) -> Array:
+        """Attitude error (3,) of the mount about each axis of the body, 1 sigma, rad."""
+        return np.asarray(np.radians(np.broadcast_to(self.mount_sigma_deg, 3)))
 
     @property
     def accel_noise_mps2(self) -> float:

@@ -284,8 +284,8 @@ class LiveProblem:
 
     Attributes:
         config: the vessel. datum: origin of world. timeline: states and slow nodes.
-        t_body_imu_m, R_body_imu: (3,), (3, 3) mount of the IMU in body. imu_mount_sigma_rad: 1 sigma of its rotation,
-            each axis.
+        t_body_imu_m, R_body_imu: (3,), (3, 3) mount of the IMU in body. imu_mount_sigma_rad: (3,) 1 sigma of its
+            rotation about each axis of the body.
         links: preintegration of the IMU. streams: by name of the sensor. motion_model: for outages.
     """
 
@@ -294,7 +294,7 @@ class LiveProblem:
     timeline: LiveTimeline
     t_body_imu_m: Array
     R_body_imu: Array
-    imu_mount_sigma_rad: float
+    imu_mount_sigma_rad: Array
     links: InertialLink
     streams: dict[str, LiveStream]
     motion_model: MotionModel

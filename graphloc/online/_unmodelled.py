@@ -84,8 +84,8 @@ class UnmodelledError:
             sensor.
         cov: (n + 3 r, n + 3 r) covariance of e (rotation, position, velocity in axes of world; bias; estimated slow
             errors) and of the left-out slow errors (east, north, up each).
-        by_mount: (n, 3) derivative of e + U m by the turn m of the IMU's mount, body axes. mount_sigma_rad: 1 sigma of
-            m, each axis.
+        by_mount: (n, 3) derivative of e + U m by the turn m of the IMU's mount, body axes. mount_sigma_rad: (3,) 1 sigma
+            of m.
         newest: the newest state. P: (n, n), its covariance without these effects, in the order and axes of e.
     """
 
@@ -93,7 +93,7 @@ class UnmodelledError:
     estimated: Mapping[str, SlowProcess]
     cov: Array
     by_mount: Array
-    mount_sigma_rad: float
+    mount_sigma_rad: Array
     newest: Newest
     P: Array
 
@@ -114,7 +114,7 @@ class UnmodelledError:
         streams = problem.streams
         left_out = untold_errors(list(streams.values()))
         mount_sigma_rad = problem.imu_mount_sigma_rad
-        if not left_out and mount_sigma_rad == 0.0:
+        if not left_out and not mount_sigma_rad.any():
             return None
         estimated = {stream.name: slow for stream, slow in estimated_beside(streams)}
         n, m = len(P), len(left_out)
@@ -218,14 +218,14 @@ class UnmodelledError:
         standing = sum((slow.sigma**2 for slow in self.left_out.values()), np.zeros(3))
         cov[:3, :3] += np.diag(np.maximum(standing - np.diagonal(cov)[:3], 0.0))
         turned = self.by_mount[_ROTATION] - self.newest.pose.rotation().matrix()
-        by = np.vstack([self.by_mount[_POSITION] - skew(lever_m) @ turned, turned])
-        return np.asarray(cov + self.mount_sigma_rad**2 * by @ by.T)
+        by = np.vstack([self.by_mount[_POSITION] - skew(lever_m) @ turned, turned]) * self.mount_sigma_rad
+        return np.asarray(cov + by @ by.T)
 
     @property
     def velocity(self) -> Array:
         """Covariance (3, 3), m^2/s^2, to add to that of the velocity."""
-        by = self.by_mount[_VELOCITY]
-        return np.asarray(self.cov[_VELOCITY, _VELOCITY] + self.mount_sigma_rad**2 * by @ by.T)
+        by = self.by_mount[_VELOCITY] * self.mount_sigma_rad
+        return np.asarray(self.cov[_VELOCITY, _VELOCITY] + by @ by.T)
 
 
 def estimated_beside(streams: Mapping[str, LiveStream]) -> list[tuple[LiveStream, SlowProcess]]:

@@ -9,7 +9,7 @@ dx + c m = b, with
 
 What no change of the states explains, c~ = c - J argmin |J X - c|, carries the information on m:
 
-    (c~'c~ + 1 / s^2) m = c~'b - t / s^2,   s: sigma of the mount, t: by which it is turned already
+    (c~'c~ + 1 / s^2) m = c~'b - t / s^2,   s: sigmas of the mount, t: by which it is turned already
 
 and the states follow by X m. So what is not known of m widens their covariance (a consider parameter, Schmidt 1966).
 Without that, fixes of centimetres tell the heading of an IMU to some tenths of a degree, and the heading of the vessel
@@ -74,9 +74,9 @@ class MountError(NamedTuple):
         return np.asarray((self.velocity * self.mean_square) @ self.velocity.transpose(0, 2, 1))
 
 
-def mount_sigma_rad(problem: Problem) -> float:
-    """Return the configured sigma of the IMU's mount, rad."""
-    return float(problem.config.sensors[problem.imu.sensor].mount_sigma_rad)
+def mount_sigma_rad(problem: Problem) -> Array:
+    """Return the configured sigma (3,) of the IMU's mount about each axis of the body, rad."""
+    return np.asarray(problem.config.sensors[problem.imu.sensor].mount_sigma_rad)
 
 
 def mount_error(
@@ -91,7 +91,7 @@ def mount_error(
         RuntimeError, numpy.linalg.LinAlgError: a state is not determined.
     """
     sigma = mount_sigma_rad(problem)
-    if sigma == 0.0:
+    if not sigma.any():
         return None
     n = len(problem.timeline)
     told = follows = _followed(*sparse_rows(graph, values), n)
@@ -99,13 +99,16 @@ def mount_error(
         # The graph takes the drift of these for motion, which would speak for a turned mount as if it were true.
         _, J, b = linearised(*with_left_out(problem, values), verdicts, prior).weighed()
         told = _followed(J, b, n)
-    cov = np.linalg.inv(told.left.T @ told.left + np.eye(3) / sigma**2)
-    turn = cov @ (told.left.T @ told.b - problem.imu_turn_rad / sigma**2)
+    # In sigmas of the mount, because those of some axes may be 0.
+    left = told.left * sigma
+    unit = np.linalg.inv(left.T @ left + np.eye(3))
+    turned = np.divide(problem.imu_turn_rad, sigma, out=np.zeros(3), where=sigma > 0.0)
+    turn, cov = sigma * (unit @ (left.T @ told.b - turned)), unit * np.outer(sigma, sigma)
     X = follows.states
     if not (np.isfinite(cov).all() and np.isfinite(turn).all() and np.isfinite(X).all()):
         raise RuntimeError("not finite")
     yaw, var = float(turn[2]), float(cov[2, 2])
-    mean_square = np.array([sigma**2, sigma**2, var + yaw**2])
+    mean_square = np.array([*sigma[:2] ** 2, var + yaw**2])
     # Keys are sorted by letter: velocities and poses come last.
     return MountError(yaw, var**0.5, mean_square, X[-6 * n :].reshape(n, 6, 3), X[-9 * n : -6 * n].reshape(n, 3, 3))
 
@@ -118,7 +121,7 @@ def followed_before(
     It is by the data before that state. None where the mount is taken as given. Arguments and errors as of
     `mount_error`.
     """
-    if mount_sigma_rad(problem) == 0.0:
+    if not mount_sigma_rad(problem).any():
         return None
     rows, n = linearised(problem, values, verdicts, prior), len(problem.timeline)
     before = rows.stamps_ns < problem.timeline.stamps_ns[k]
@@ -179,11 +182,10 @@ def with_mount_estimated(
         The problem, its solution and prior, all unchanged where the mount is near; and the error of the mount by that
             solution, None where the mount is taken as given, or not determined.
     """
-    last, sigma = len(problem.timeline) - 1, mount_sigma_rad(problem)
+    last, sigma = len(problem.timeline) - 1, float(mount_sigma_rad(problem)[2])
 
     def cost(problem: Problem, settled: Settled, prior: StartPrior) -> float:
-        off = problem.imu_turn_rad / sigma
-        return 0.5 * float(off @ off) + cost_of_run(problem, settled.values, prior)
+        return 0.5 * (float(problem.imu_turn_rad[2]) / sigma) ** 2 + cost_of_run(problem, settled.values, prior)
 
     def found(problem: Problem, settled: Settled, prior: StartPrior) -> MountError | None:
         try:
@@ -193,7 +195,7 @@ def with_mount_estimated(
 
     error, lowest = found(problem, settled, prior), np.inf
     for _ in range(_ROUNDS):
-        if error is None or abs(error.yaw_rad) < max(_MATTERS * sigma, _TOLD * error.sigma_rad):
+        if error is None or abs(error.yaw_rad) <= max(_MATTERS * sigma, _TOLD * error.sigma_rad):
             break
         turn = np.array([0.0, 0.0, error.yaw_rad])
         if abs(problem.imu_turn_rad + turn).max() > _MOST * sigma:

@@ -109,9 +109,9 @@ def mount_warning(problem: Problem, error: MountError) -> list[str]:
 
     The estimated turn is shrunk by its prior, so its scatter is what the other sensors take off the prior's variance.
     """
-    sigma = mount_sigma_rad(problem)
+    sigma = float(mount_sigma_rad(problem)[2])
     turn, told = float(problem.imu_turn_rad[2]) + error.yaw_rad, sigma**2 - error.sigma_rad**2
-    if told < _TOLD * sigma**2 or (sigmas := abs(turn) / float(np.sqrt(told))) < _TURNED:
+    if told <= _TOLD * sigma**2 or (sigmas := abs(turn) / float(np.sqrt(told))) < _TURNED:
         return []
     said = f"{problem.imu.sensor}: the other sensors turn its mount by {np.degrees(turn):+.1f} +- {np.degrees(error.sigma_rad):.1f} deg of yaw"
     kept = "" if problem.imu_turn_rad.any() else ", though it stays as configured"
