@@ -13,14 +13,15 @@ import graphloc.solve
 from graphloc import app
 from graphloc.build import Problem, make_problem
 from graphloc.config import VesselConfig
+from graphloc.errors import SolveError
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import heading_deg_from_yaw, wrap_angle
 from graphloc.measurements import CompassHeading, GnssPosition, Measurement, PoseFix
 from graphloc.recording import Recording
 from graphloc.solution import Solution
-from graphloc.solve._legs import _own, overlap_ns, seams, solve_legs
-from graphloc.solve._parts import mean_of
+from graphloc.solve._legs import KnownHeading, _own, overlap_ns, seams, solve_legs
+from graphloc.solve._parts import mean_of, solve_parts
 from tests.slowly import sparsely
 
 S = 10**9
@@ -115,14 +116,14 @@ def test_no_time_is_missing_at_a_seam_of_legs_that_are_not_in_step(run: Simulate
     out_of_step = int(0.7 * (stamps[k + 1] - stamps[k]))
     shifts = iter([0, out_of_step])
 
-    def solve(part: Recording, _heading_deg: float | None) -> Solution:
+    def solve(part: Recording, _heading: KnownHeading | None) -> Solution:
         assert part.imu is not None
         first, last = (int(ns) for ns in part.imu.stamps_ns[[0, -1]])
         leg = _own(whole, first, last, last, None)
         track = replace(leg.trajectory, stamps_ns=leg.trajectory.stamps_ns + next(shifts))
         return replace(leg, trajectory=track)
 
-    legs, _ = solve_legs(run.recording, [int(stamps[k]) + out_of_step + 1], LEG_S, solve)
+    legs, _ = solve_legs(run.recording, None, [int(stamps[k]) + out_of_step + 1], LEG_S, solve)
     apart = np.diff(np.concatenate([leg.trajectory.stamps_ns for leg in legs]))
     assert (apart > 0).all()
     assert apart.max() <= longest
@@ -157,6 +158,51 @@ def test_a_heading_that_no_sensor_tells_is_handed_on(run: SimulatedRun, monkeypa
     for seam, heading_deg in zip(where, asked[1:], strict=True):
         true = run.truth.at(np.array([seam - overlap_ns(60.0)]))
         assert heading_deg == pytest.approx(float(heading_deg_from_yaw(true.yaw_rad)[0]), abs=6.0)
+
+
+@pytest.mark.parametrize(("sigma_deg", "handed_on"), [(4.0, True), (12.0, False)])
+def test_a_heading_is_handed_on_as_well_as_it_is_known(
+    run: SimulatedRun, whole: Solution, sigma_deg: float, *, handed_on: bool
+) -> None:
+    """Not as well as the one at the start was configured; and twice the variance, since both legs have the data of the overlap."""
+    asked, known = list[KnownHeading | None](), KnownHeading(12.0, 3.0)
+    assert whole.trajectory.cov is not None
+    cov = whole.trajectory.cov.copy()
+    cov[:, 5, 5] = np.radians(sigma_deg) ** 2
+    sure = replace(whole, trajectory=replace(whole.trajectory, cov=cov))
+
+    def solve(part: Recording, heading: KnownHeading | None) -> Solution:
+        asked.append(heading)
+        assert part.imu is not None
+        first, last = (int(ns) for ns in part.imu.stamps_ns[[0, -1]])
+        return _own(sure, first, last, last, None)
+
+    solve_legs(run.recording, known, [begin_ns(run) + 50 * S], LEG_S, solve)
+    assert asked[0] == known
+    if handed_on:
+        assert asked[1] is not None
+        assert asked[1].sigma_deg == pytest.approx(np.sqrt(2.0) * sigma_deg)
+    else:
+        assert asked[1] is None
+
+
+def test_the_heading_at_the_start_is_none_after_a_gap(run: SimulatedRun) -> None:
+    """A vessel that lay moored after one was 45 deg off at a bound of 30: the heading of the run's start was taken for that of each part."""
+    assert run.recording.imu is not None
+    t = (run.recording.imu.stamps_ns - begin_ns(run)) * 1e-9
+    paused = replace(run.recording, imu=run.recording.imu.where((t < 30.0) | (t > 60.0)))
+    asked, known = list[KnownHeading | None](), KnownHeading(12.0, 3.0)
+
+    def solve(_part: Recording, heading: KnownHeading | None) -> Solution:
+        asked.append(heading)
+        raise SolveError("only asked")
+
+    with pytest.raises(SolveError, match="only asked"):
+        solve_parts(paused, known, 20.0, 1800.0, {"gnss"}, solve)
+    assert asked == [known, None]
+    config = run.config.with_start_heading(*known)
+    assert (config.start.heading_deg, config.start.heading_sigma_deg) == known
+    assert config.with_start_heading(None).start.heading_sigma_deg == known.sigma_deg
 
 
 def test_a_leg_without_a_place_is_no_reason_to_fail() -> None:

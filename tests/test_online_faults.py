@@ -1066,6 +1066,16 @@ def test_a_damaged_snapshot_is_reported_and_not_used(tmp_path: Path, saved: str,
     assert fed.errors_m[-1] < 2.0
 
 
+def test_a_start_after_a_resume_does_not_take_the_heading_of_the_first_one(tmp_path: Path, saved: str) -> None:
+    """The vessel has turned since: restarted after a silence of the IMU, one was 86 deg off at a bound of 42."""
+    path, base = tmp_path / "snapshot.json", arrivals_of(run_of())
+    path.write_text(saved, encoding="utf-8")
+    online = OnlineSmoother(run_of().config.with_start_heading(10.0), rows=SENSORS, inertial=INERTIAL, snapshot=path)
+    fed = feed(online, run_of(), base[at_s(base, 8.5) : at_s(base, 9.0)])
+    assert [e for e in fed.events if e.startswith("resumed from a snapshot")]
+    assert online._setup.config.start.heading_deg is None  # noqa: SLF001
+
+
 @pytest.mark.parametrize("adapt", [True, False])
 def test_raised_noise_is_resumed_while_adapt_noise_is_on(tmp_path: Path, saved: str, *, adapt: bool) -> None:
     """What a snapshot says of the IMU's noise ends where `adapt_noise` has been switched off since."""

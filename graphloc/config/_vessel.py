@@ -201,9 +201,14 @@ class VesselConfig(Block):
         """Return the configuration with numbers of sensors so many times as large; `times`: by sensor and key."""
         return self.with_sensors({name: self.sensors[name].scaled(by) for name, by in times.items()})
 
-    def with_start_heading(self, heading_deg: float | None) -> VesselConfig:
-        """Return the configuration of a run that starts with this heading, deg; None: with none that is configured."""
-        return self.model_copy(update={"start": self.start.model_copy(update={"heading_deg": heading_deg})})
+    def with_start_heading(self, heading_deg: float | None, sigma_deg: float | None = None) -> VesselConfig:
+        """Return the configuration of a run that starts with this heading, deg; None: with none that is configured.
+
+        Args:
+            sigma_deg: its 1 sigma; None: as configured.
+        """
+        known = {"heading_deg": heading_deg, "heading_sigma_deg": sigma_deg or self.start.heading_sigma_deg}
+        return self.model_copy(update={"start": self.start.model_copy(update=known)})
 
     def by_turns(self, name: str) -> list[str]:
         """Return the names of the enabled sensors that read one receiver's fixes by turns (`fixes`), this one among them."""

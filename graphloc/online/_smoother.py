@@ -532,6 +532,7 @@ class OnlineSmoother:
             self._say(f"the snapshot cannot be used ({in_one_line(error)}): starts without it")
             return
         self._tracking, self._persistent = tracking, persistent
+        self._setup = setup.without_start_heading()  # that was the heading at the first start
         waiting = [m for m in self._waiting.taken() if m is not newest]
         tracking.resume(found.anchor, found.imu, newest)
         self._say(f"resumed from a snapshot {age_s:.1f} s old", warns=False)

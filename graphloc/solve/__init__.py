@@ -18,6 +18,7 @@ from graphloc.inertial import InertialRow
 from graphloc.offsets import Probe
 from graphloc.recording import Progress, Recording, quiet
 from graphloc.solution import Solution
+from graphloc.solve._legs import KnownHeading
 from graphloc.solve._memory import give_back_memory
 from graphloc.solve._offsets import offsets_of
 from graphloc.solve._parts import solve_parts
@@ -54,8 +55,8 @@ def smooth(
         SolveError: the run cannot be started or solved; the text says why.
     """
 
-    def solve(part: Recording, heading_deg: float | None) -> Solution:
-        begun = config if heading_deg is None else config.with_start_heading(heading_deg)
+    def solve(part: Recording, heading: KnownHeading | None) -> Solution:
+        begun = config.with_start_heading(None) if heading is None else config.with_start_heading(*heading)
         said = list[str]()
         for tried in range(_MOST_TIMES + 1):
             problem = make_problem(part, begun, datum, rows, inertial)
@@ -76,8 +77,9 @@ def smooth(
     imu = config.of_kind(inertial.kind).values()
     bridge_s = min((sensor.max_bridge_s for sensor in imu), default=np.inf)
     absolute = {name for name, row in rows_of(config, rows).items() if row.absolute}
-    leg_s = config.timeline.leg_s
-    return _on_deep_stack(lambda: solve_parts(recording, bridge_s, leg_s, absolute, solve))
+    leg_s, start = config.timeline.leg_s, config.start
+    heading = None if start.heading_deg is None else KnownHeading(start.heading_deg, start.heading_sigma_deg)
+    return _on_deep_stack(lambda: solve_parts(recording, heading, bridge_s, leg_s, absolute, solve))
 
 
 def _with_offsets(solution: Solution, result: BatchResult, probe: Probe) -> Solution:

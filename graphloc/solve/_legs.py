@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +26,19 @@ from graphloc.trajectory import bounds_95
 
 _OVERLAP_S, _SHARE = 60.0, 0.2  # overlap on each side of a seam, s, and at most this share of a leg
 _LOOK = 0.1  # share of a leg, to either side, within which a seam is placed
-_HANDED_ON_RAD = np.radians(15.0)  # largest 1 sigma of a heading that is handed on: the next leg takes it as known
+_HANDED_ON_DEG = 15.0  # largest 1 sigma of a heading that is handed on: the next leg takes it as known
 _ENOUGH = 0.9  # a seam has at least this share of the most positions that any candidate has near it
 
-Solve = Callable[[Recording, float | None], Solution]
-"""Solves a recording, given the compass heading (deg) at its start, or None where that is not known."""
+
+class KnownHeading(NamedTuple):
+    """Compass heading at the start of a recording, and its 1 sigma, deg."""
+
+    deg: float
+    sigma_deg: float
+
+
+Solve = Callable[[Recording, KnownHeading | None], Solution]
+"""Solves a recording, given the heading at its start, or None where that is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +83,13 @@ def overlap_ns(leg_s: float) -> int:
 
 
 def solve_legs(
-    recording: Recording, seams_ns: Collection[int], leg_s: float, solve: Solve
+    recording: Recording, heading: KnownHeading | None, seams_ns: Collection[int], leg_s: float, solve: Solve
 ) -> tuple[list[Solution], Apart]:
     """Solve the legs of a run in turn.
 
     Args:
-        seams_ns: stamps where the run is cut. leg_s: length of a leg, for the overlap. solve: solves a leg.
+        heading: at its start, where known. seams_ns: stamps where the run is cut. leg_s: length of a leg, for the
+            overlap. solve: solves a leg.
 
     Returns:
         The solution of each leg for its own time, and the largest difference between two legs where they meet.
@@ -91,13 +101,13 @@ def solve_legs(
     over = overlap_ns(leg_s)
     edges = [np.iinfo(np.int64).min // 2, *seams_ns, np.iinfo(np.int64).max // 2]
     legs: list[Solution] = []
-    heading_deg, before, apart = None, None, Apart()
+    before, apart = None, Apart()
     for number, (begin, end) in enumerate(pairwise(edges)):
-        whole = solve(_between(recording, begin - over, end + over), heading_deg)
+        whole = solve(_between(recording, begin - over, end + over), heading)
         if before is not None:
             apart = _farther(apart, before, whole, begin)
             legs.append(_own(before, edges[number - 1], begin, _first_after(whole, begin), legs[-1] if legs else None))
-        heading_deg = _known_heading_deg(whole, np.array([end - over]))
+        heading = _known_heading(whole, np.array([end - over]))
         before = whole
         give_back_memory()
     assert before is not None
@@ -111,14 +121,20 @@ def _first_after(leg: Solution, stamp_ns: int) -> int:
     return int(stamps_ns[k]) if k < len(stamps_ns) else stamp_ns
 
 
-def _known_heading_deg(leg: Solution, at_ns: NDArray[np.int64]) -> float | None:
-    """Return the compass heading (deg) at a stamp (1,); None if the leg has no state there, or hardly knows it."""
+def _known_heading(leg: Solution, at_ns: NDArray[np.int64]) -> KnownHeading | None:
+    """Return the heading at a stamp (1,); None if the leg has no state there, or hardly knows it.
+
+    The data of the overlap, which the next leg has as well, may be all that tells it: so its variance is doubled.
+    """
     if not leg.trajectory.covers(at_ns)[0]:
         return None
     there = leg.trajectory.at(at_ns)
-    if there.cov is None or there.cov[0, 5, 5] > _HANDED_ON_RAD**2:
+    if there.cov is None:
         return None
-    return float(heading_deg_from_yaw(there.yaw_rad)[0])
+    sigma_deg = float(np.degrees(np.sqrt(2.0 * there.cov[0, 5, 5])))
+    return (
+        KnownHeading(float(heading_deg_from_yaw(there.yaw_rad)[0]), sigma_deg) if sigma_deg <= _HANDED_ON_DEG else None
+    )
 
 
 def _between(recording: Recording, begin_ns: int, end_ns: int) -> Recording:

@@ -22,7 +22,7 @@ from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.offsets import joined
 from graphloc.recording import Recording
 from graphloc.solution import Graded, SlowEstimate, Solution, SolveStats
-from graphloc.solve._legs import Solve, seams, solve_legs
+from graphloc.solve._legs import KnownHeading, Solve, seams, solve_legs
 from graphloc.time import utc_text
 from graphloc.trajectory import Trajectory
 
@@ -30,12 +30,17 @@ _T = TypeVar("_T")
 
 
 def solve_parts(
-    recording: Recording, bridge_s: float, leg_s: float, absolute: Collection[str], solve: Solve
+    recording: Recording,
+    heading: KnownHeading | None,
+    bridge_s: float,
+    leg_s: float,
+    absolute: Collection[str],
+    solve: Solve,
 ) -> Solution:
     """Cut the recording at IMU gaps longer than `bridge_s`, and long parts into legs; solve these and join them.
 
     Args:
-        leg_s: about how long legs are at most. absolute: names of the sensors that measure position.
+        heading: at the start of the recording, where known; the vessel may have turned in a gap. leg_s: about how long legs are at most. absolute: names of the sensors that measure position.
 
     Raises:
         SolveError: no part could be solved; the error of the first one.
@@ -43,14 +48,15 @@ def solve_parts(
     parts = _cut(recording, bridge_s)
     cuts = [seams(part, leg_s, absolute) for part in parts]
     if cuts == [[]]:
-        return solve(recording, None)
+        return solve(recording, heading)
     solutions, rows, failure = list[Solution](), list(recording.rows), None
     warnings, events = list[str](), list[str]()
     for part, where in zip(parts, cuts, strict=True):
         assert part.imu is not None
         start, stop = (utc_text(int(part.imu.stamps_ns[k])) for k in (0, -1))
         try:
-            legs, said, wrong = _in_legs(replace(part, rows=()), where, leg_s, solve)
+            known = heading if part is parts[0] else None
+            legs, said, wrong = _in_legs(replace(part, rows=()), known, where, leg_s, solve)
             solutions += legs
             (warnings if wrong else events).extend(said)
             if len(parts) > 1:
@@ -70,7 +76,7 @@ def solve_parts(
 
 
 def _in_legs(
-    part: Recording, where: Collection[int], leg_s: float, solve: Solve
+    part: Recording, heading: KnownHeading | None, where: Collection[int], leg_s: float, solve: Solve
 ) -> tuple[list[Solution], list[str], bool]:
     """Return the solutions of a part: in legs, cut at the stamps `where`, if it is long.
 
@@ -78,11 +84,11 @@ def _in_legs(
     warnings.
     """
     if not where:
-        return [solve(part, None)], [], False
+        return [solve(part, heading)], [], False
     try:
-        legs, apart = solve_legs(part, where, leg_s, solve)
+        legs, apart = solve_legs(part, heading, where, leg_s, solve)
     except SolveError as error:
-        return [solve(part, None)], [f"solved in one piece, not in legs: a leg failed ({error})"], False
+        return [solve(part, heading)], [f"solved in one piece, not in legs: a leg failed ({error})"], False
     said = f"where they meet they differ by at most {apart.m:.2f} m and {apart.deg:.1f} deg"
     said += "" if apart.within else ", more than their bounds allow"
     return legs, [f"solved in {len(legs)} overlapping legs (`timeline.leg_s`): {said}"], not apart.within
