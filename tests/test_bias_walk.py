@@ -11,6 +11,7 @@ import pytest
 
 from graphloc import app
 from graphloc.config import ImuConfig
+from graphloc.config._instruments import STANDARD_GRAVITY_MPS2
 from graphloc.eval.simulate import Scenario, SimulatedRun
 from graphloc.frames import Array, wrap_angle
 from graphloc.judge.bias_walk import MOST_TIMES
@@ -76,6 +77,20 @@ def test_a_gyroscope_that_warms_up_keeps_its_heading(cold: SimulatedRun, warm: S
     off_deg, inside = heading(warm, found)
     assert off_deg < 1.0
     assert inside > 0.9
+
+
+def test_vibration_is_noise_and_no_walk() -> None:
+    """The biases follow noise that is configured too small: of a shaken car they were said to walk by 675 times more, and the heading was 6 deg off."""
+    run, shaken_mps2 = simulate_slowly(RUN, 2, 1.25), 1.0
+    imu = run.recording.imu
+    assert imu is not None
+    accel_mps2 = imu.accel_mps2 + np.random.default_rng(3).normal(0.0, shaken_mps2, imu.accel_mps2.shape)
+    found = smooth_run(replace(run, recording=replace(run.recording, imu=replace(imu, accel_mps2=accel_mps2))))
+    assert not lines(found)
+    (said,) = (w for w in found.stats.warnings if "its noise is configured too small" in w)
+    taken_ug = float(said.split("accel_noise_ug_per_sqrt_hz is 300, ")[1].split(" ")[0])
+    true_ug = shaken_mps2 / np.sqrt(50.0) / STANDARD_GRAVITY_MPS2 * 1e6
+    assert 0.5 * true_ug < taken_ug < 1.1 * true_ug
 
 
 def test_a_walk_that_is_not_to_be_raised_is_said(warm: SimulatedRun) -> None:

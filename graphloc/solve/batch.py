@@ -34,7 +34,7 @@ from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.judge.bias_walk import BiasWanders, with_needed_walk
 from graphloc.judge.decide import Stage, Verdicts
-from graphloc.judge.imu_noise import CONTRADICTION, noise_step, with_needed_noise
+from graphloc.judge.imu_noise import CONTRADICTION, LEAST_TIMES, noise_step, scattered, with_needed_noise
 from graphloc.judge.sensor_noise import scattering
 from graphloc.recording import Progress, quiet
 from graphloc.solve._final_passes import LAST_PASSES, MAX_SENSOR_ROUNDS, SolvedRun, as_they_scatter
@@ -159,7 +159,26 @@ class _Underway:
     ) -> None:
         self._configured, self._progress, self._newest = problem, progress, newest
         self._solve = partial(first_solution, progress=progress, newest=newest, doubt_imu=doubt_imu, near_rad=near_rad)
-        self._solve_first(problem)
+        self._solve_first(self._shaken(problem))
+
+    def _shaken(self, problem: Problem) -> Problem:
+        """Return the problem with the noise that an IMU needs whose samples scatter more than configured.
+
+        With too little of it, estimates of the biases are too sure, so that they seem to wander, or the IMU seems wrong.
+        """
+        config = problem.config.sensors[problem.imu.sensor]
+        if (
+            self._newest
+            or not config.adapt_noise
+            or (scattered(problem.imu, config, problem.noise_scale) < LEAST_TIMES).all()
+        ):
+            return problem
+        try:
+            begun, (tried, settled) = self._solve(problem, doubt_imu=False)
+        except SolveError:
+            return problem
+        noisier = with_needed_noise(tried, settled.values, settled.verdicts, begun.prior)
+        return problem if noisier is None else replace(noisier, usual_motion=None)
 
     def _solve_first(self, problem: Problem) -> None:
         """Solve a problem from its start, with more walk of the IMU's biases where they go farther than configured."""
