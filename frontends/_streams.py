@@ -18,8 +18,8 @@ from graphloc.frames import Array
 from graphloc.frontends import nmea
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import FILTER, WATER, bare_topic
+from graphloc.frontends._said import Part, Said, SaidAlong, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._vendor_said import Part, Said, SaidAlong, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
 from graphloc.frontends.decode import (
     GPS_FIXES,
     IMU,
