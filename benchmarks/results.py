@@ -14,6 +14,7 @@ import os
 import platform
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -84,11 +85,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "F.6": sweep.workers,
     "F.cal": calibration.figures,
     "F.drawn": drawn.figures,
-    "F.mount": drawn.askew,
-    "F.antenna": drawn.antennas,
-    "F.alone": drawn.alone,
-    "F.noise": drawn.noise,
-    "F.stated": drawn.stated,
+    **{item: partial(drawn.varied, item) for item in drawn.VARIED},
 }
 
 
