@@ -382,7 +382,7 @@ class Tracking:
 
     # Rebuild, end
 
-    def rebuild(self, why: str, until_ns: int, misled: float = 1.0) -> str:
+    def rebuild(self, why: str, until_ns: int, misled: float) -> str:
         """Build the window anew.
 
         It begins at its first anchor, with all its measurements; if that fails, at the last anchor, without later
