@@ -13,6 +13,7 @@ import json
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +31,9 @@ from graphloc.replay import replay
 from graphloc.solution import Solution
 from graphloc.trajectory import Trajectory
 
-SEEDS = range(1000, 1080)  # none was looked at when a model or a number was chosen
-NOISE_SEEDS, STATED_SEEDS = range(1100, 1116), range(1120, 1136)  # nor these
-ASKEW_SEEDS, DISPLACED_SEEDS = range(1140, 1156), range(1160, 1176)
-LONE_SEEDS = range(1180, 1230)
+SEEDS = range(1000, 1080)  # none was looked at when a model or a number was chosen, nor those of `VARIED`
 Found = dict[str, Any]
+Runs = dict[str, DrawnRun]
 _TOO_SURE = 6.0  # horizontal NEES: 2 where the covariance is true
 
 
@@ -114,18 +113,17 @@ def _vibrating(run: DrawnRun) -> DrawnRun:
     return replace(run, recording=replace(run.recording, imu=shaken))
 
 
-def _with_noise(seed: int) -> Found:
-    drawn = drawn_run(seed)
-    runs = {
+def _noisy(drawn: DrawnRun) -> Runs:
+    """An IMU that is noisier than configured, and one that vibrates."""
+    return {
         "as it is": drawn,
         "by data sheet, not adapted": _by_data_sheet(drawn, adapt=False),
         "by data sheet": _by_data_sheet(drawn, adapt=True),
         "vibrating": _vibrating(drawn),
     }
-    return _both_ways(runs)
 
 
-def _both_ways(runs: dict[str, DrawnRun]) -> Found:
+def _both_ways(runs: Runs) -> Found:
     found: Found = {}
     for name, run in runs.items():
         found[f"{name}, batch"] = _tried(lambda run=run: app.smooth_recording(run.recording, run.config).solution, run)
@@ -147,12 +145,6 @@ def _variants(item: str, label: str, found: list[Found]) -> list[Row]:
     return rows
 
 
-def noise(pool: ProcessPoolExecutor) -> list[Row]:
-    """Figures of an IMU that is noisier than configured, and of one that vibrates."""
-    found = list(pool.map(_with_noise, NOISE_SEEDS))
-    return _variants("F.noise", f"{len(found)} drawn vessels, IMU noise", found)
-
-
 def stating(run: DrawnRun, kind: type[Measurement], share: float) -> DrawnRun:
     """The vessel, whose fixes (`GnssPosition`) or matches (`PoseFix`) state only a share of their sigmas."""
 
@@ -166,22 +158,14 @@ def stating(run: DrawnRun, kind: type[Measurement], share: float) -> DrawnRun:
     return replace(run, recording=run.recording.changed(less))
 
 
-def _stating(seed: int) -> Found:
-    drawn = drawn_run(seed)
-    return _both_ways(
-        {
-            "as they are": drawn,
-            "of matches a third": stating(drawn, PoseFix, 1 / 3),
-            "of matches a tenth": stating(drawn, PoseFix, 0.1),
-            "of fixes a tenth": stating(drawn, GnssPosition, 0.1),
-        }
-    )
-
-
-def stated(pool: ProcessPoolExecutor) -> list[Row]:
-    """Figures of fixes and matches that state less noise than they have."""
-    found = list(pool.map(_stating, STATED_SEEDS))
-    return _variants("F.stated", f"{len(found)} drawn vessels, stated sigmas", found)
+def _stated(drawn: DrawnRun) -> Runs:
+    """Fixes and matches that state less noise than they have."""
+    return {
+        "as they are": drawn,
+        "of matches a third": stating(drawn, PoseFix, 1 / 3),
+        "of matches a tenth": stating(drawn, PoseFix, 0.1),
+        "of fixes a tenth": stating(drawn, GnssPosition, 0.1),
+    }
 
 
 def _askew(run: DrawnRun) -> DrawnRun:
@@ -200,16 +184,10 @@ def _as_given(run: DrawnRun) -> DrawnRun:
     return replace(run, config=run.config.with_sensors({"imu": imu}))
 
 
-def _mounted(seed: int) -> Found:
-    drawn = drawn_run(seed)
+def _mounted(drawn: DrawnRun) -> Runs:
+    """An IMU that sits askew."""
     askew = _askew(drawn)
-    return _both_ways({"as configured": drawn, "askew, taken as given": _as_given(askew), "askew": askew})
-
-
-def askew(pool: ProcessPoolExecutor) -> list[Row]:
-    """Figures of an IMU that sits askew."""
-    found = list(pool.map(_mounted, ASKEW_SEEDS))
-    return _with_bounds("F.mount", f"{len(found)} drawn vessels, IMU's mount", found)
+    return {"as configured": drawn, "askew, taken as given": _as_given(askew), "askew": askew}
 
 
 def _with_bounds(item: str, label: str, found: list[Found]) -> list[Row]:
@@ -239,22 +217,14 @@ def displaced(run: DrawnRun, *, sigma_m: float, known: bool = False) -> DrawnRun
     return replace(run, config=run.config.with_sensors(antennas))
 
 
-def _displaced(seed: int) -> Found:
-    drawn = drawn_run(seed)
-    return _both_ways(
-        {
-            "as configured": drawn,
-            "as configured, estimated": displaced(drawn, sigma_m=1.0, known=True),
-            "elsewhere, taken as given": displaced(drawn, sigma_m=0.0),
-            "elsewhere, estimated": displaced(drawn, sigma_m=1.0),
-        }
-    )
-
-
-def antennas(pool: ProcessPoolExecutor) -> list[Row]:
-    """Figures of antennas that sit a metre or two from where they are configured."""
-    found = list(pool.map(_displaced, DISPLACED_SEEDS))
-    return _with_bounds("F.antenna", f"{len(found)} drawn vessels, antenna", found)
+def _antennas(drawn: DrawnRun) -> Runs:
+    """Antennas that sit a metre or two from where they are configured."""
+    return {
+        "as configured": drawn,
+        "as configured, estimated": displaced(drawn, sigma_m=1.0, known=True),
+        "elsewhere, taken as given": displaced(drawn, sigma_m=0.0),
+        "elsewhere, estimated": displaced(drawn, sigma_m=1.0),
+    }
 
 
 def lone(run: DrawnRun) -> DrawnRun | None:
@@ -268,15 +238,32 @@ def lone(run: DrawnRun) -> DrawnRun | None:
     return replace(run, recording=replace(run.recording, measurements=left), config=config)
 
 
-def _lone(seed: int) -> Found | None:
-    run = lone(drawn_run(seed))
-    return None if run is None else _both_ways({"compass": run})
+def _lone(drawn: DrawnRun) -> Runs:
+    """What most vessels have: one receiver and a compass, and nothing that tells its drift and jumps from motion."""
+    run = lone(drawn)
+    return {} if run is None else {"compass": run}
 
 
-def alone(pool: ProcessPoolExecutor) -> list[Row]:
-    """Figures of what most vessels have: one receiver and a compass, and nothing that tells its drift and jumps from motion."""
-    found = [one for one in pool.map(_lone, LONE_SEEDS) if one is not None]
-    return _with_bounds("F.alone", f"{len(found)} drawn vessels, one receiver and a", found)
+# By item: what is changed, its seeds, what becomes of a vessel, and how the figures of it are made.
+VARIED: dict[str, tuple[str, range, Callable[[DrawnRun], Runs], Callable[[str, str, list[Found]], list[Row]]]] = {
+    "F.mount": ("IMU's mount", range(1140, 1156), _mounted, _with_bounds),
+    "F.antenna": ("antenna", range(1160, 1176), _antennas, _with_bounds),
+    "F.alone": ("one receiver and a", range(1180, 1230), _lone, _with_bounds),
+    "F.noise": ("IMU noise", range(1100, 1116), _noisy, _variants),
+    "F.stated": ("stated sigmas", range(1120, 1136), _stated, _variants),
+}
+
+
+def _varied(item: str, seed: int) -> Found:
+    _, _, vary, _ = VARIED[item]
+    return _both_ways(vary(drawn_run(seed)))
+
+
+def varied(item: str, pool: ProcessPoolExecutor) -> list[Row]:
+    """Figures of vessels that are changed."""
+    what, seeds, _, rows = VARIED[item]
+    found = [one for one in pool.map(partial(_varied, item), seeds) if one]
+    return rows(item, f"{len(found)} drawn vessels, {what}", found)
 
 
 def _line(found: Found, before: Found | None) -> str:

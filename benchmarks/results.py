@@ -14,17 +14,18 @@ import os
 import platform
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
 import batch
 import calibration
-import compass
 import dead_reckoning
 import docking
 import drawn
 import drawn_bags
 import drills
+import erring
 import fuzz
 import harbours
 import matcher
@@ -38,9 +39,7 @@ import smoothing
 import soak
 import sweep
 import tag_detector
-import warming_imu
 import where
-import wrong_imu
 from _rows import ROOT, Row
 
 FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
@@ -50,7 +49,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "A.4": smoothing.starts,
     "A.5": smoothing.outages,
     "A.6": smoothing.speed,
-    "A.dev": compass.figures,
+    "A.dev": erring.compass,
     "A.drawn": drawn_bags.figures,
     "A.odd": odd.figures,
     "B.1": simulator.signals,
@@ -77,8 +76,8 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "E.day": soak.day,
     "E.dark": dead_reckoning.figures,
     "E.ekf": slow_filter.figures,
-    "E.imu": wrong_imu.figures,
-    "E.warm": warming_imu.figures,
+    "E.imu": erring.wrong_imu,
+    "E.warm": erring.warming_imu,
     "F.3": batch.figures,
     "F.3p": where.figures,
     "F.4": fuzz.figures,
@@ -86,11 +85,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "F.6": sweep.workers,
     "F.cal": calibration.figures,
     "F.drawn": drawn.figures,
-    "F.mount": drawn.askew,
-    "F.antenna": drawn.antennas,
-    "F.alone": drawn.alone,
-    "F.noise": drawn.noise,
-    "F.stated": drawn.stated,
+    **{item: partial(drawn.varied, item) for item in drawn.VARIED},
 }
 
 

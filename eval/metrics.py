@@ -370,7 +370,7 @@ def held_out_table(
     return _table("Against held-out fixes", rows, note)
 
 
-def speed_table(estimates: _Named, check: SpeedSeries, switched_off: str = "") -> Table:
+def speed_table(estimates: _Named, check: SpeedSeries, switched_off: str) -> Table:
     """Return a table with a row per estimate, against an independent forward speed.
 
     Args:

@@ -59,20 +59,18 @@ def suspect_tags(recording: Recording, config: VesselConfig, solution: Solution)
     track = solution.trajectory
     sightings = [m for m in recording.of(TagSighting) if track.covers(np.array([m.stamp_ns]))[0]]
     said_of_mounts = list(_estimated_mounts(sightings, solution))
-    if hanging := _upside_down(sightings, config):  # then nothing else that tags say can be judged
+    # Of what any of these finds: nothing else that tags say can be judged then, mounts included.
+    if hanging := _upside_down(sightings, config):
         return hanging
     cameras = {(m.sensor, m.camera) for m in sightings}
     found = {camera: mount_off(solution, *camera).as_matrix() for camera in cameras}
     sightings = [replace(m, R_body_camera=found[m.sensor, m.camera] @ m.R_body_camera) for m in sightings]
-    behind = _seen_from_behind(sightings, recording, config, solution)
-    if behind:  # then nothing else that tags say can be judged, mounts included
-        return behind
-    facing = _facing_elsewhere(sightings, rows, config, solution)
-    if facing:  # then nothing else that tags say can be judged
-        return facing
-    turned = _turned_mounts(sightings, rows, solution)
-    if turned:  # then nothing else that tags say can be judged
-        return turned
+    if amiss := (
+        _seen_from_behind(sightings, recording, config, solution)
+        or _facing_elsewhere(sightings, rows, config, solution)
+        or _turned_mounts(sightings, rows, solution)
+    ):
+        return amiss
     images = _by_image(sightings)
     said = _by_spacing(images) | _by_the_others(images)
     by_tag: dict[Key, list[TagSighting]] = defaultdict(list)

@@ -59,9 +59,7 @@ def corner_factors(
     # GTSAM's linear factors have at most three keys: so one factor for each tag.
     for k, constant in enumerate(corners.survey_errors):
         own = slice(8 * k, 8 * k + 8)
-        of_tag = Residual(
-            raw=raw[own], cov=m.cov[own, own], jacobian=lambda: np.zeros((8, 6)), prior=1.0, size_m=None, size_deg=None
-        )
+        of_tag = Residual(raw=raw[own], cov=m.cov[own, own], jacobian=lambda: np.zeros((8, 6)))
         terms = [by_body._replace(jacobian=by_body.jacobian[own])]
         if seen.own and slow_key is not None:
             terms.append(Term(slow_key, slow_value, by_slow[own]))
@@ -100,9 +98,8 @@ def _tie(seen: TagsSeen, dock: DockConfig, config: AprilTagConfig, at: Attachmen
         kept = np.full(n, 1.0 - share)
         expected, bridge = seen.slow, sigma * np.sqrt(2.0 / time_s * dt_s * share * (1.0 - share))
     residual = Residual(
-        raw=seen.slow - expected, cov=np.diag(np.maximum(bridge, tie) ** 2), jacobian=lambda: np.zeros((n, 6)), prior=1.0,
-        size_m=None, size_deg=None,
-    )  # fmt: skip
+        raw=seen.slow - expected, cov=np.diag(np.maximum(bridge, tie) ** 2), jacobian=lambda: np.zeros((n, 6))
+    )
     terms = [
         Term(at.leaf_keys[0], seen.slow, np.eye(n)),
         Term(at.slow_key, np.array(at.slow_value), -kept[:, None] * picked),

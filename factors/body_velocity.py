@@ -77,9 +77,6 @@ def residuals(m: BodyVelocity, config: BodyVelocityConfig, at: Attachment) -> tu
             jacobian=by_pose,
             slow_jacobian=by_slow,
             velocity_jacobian=by_velocity,
-            prior=1.0,
-            size_m=None,
-            size_deg=None,
         ),
     )
 

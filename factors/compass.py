@@ -99,8 +99,6 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
             cov=np.array([[sigma**2]]),
             jacobian=lambda: _slope(at, config, yaw) * _yaw_jacobian(R, x_body, x)[None, :],
             slow_jacobian=lambda: terms[None, :],
-            prior=1.0,
-            size_m=None,
             size_deg=abs(math.degrees(raw[0])),
         ),
     )

@@ -99,9 +99,7 @@ def residuals(m: GnssPosition, config: GnssConfig, at: Attachment) -> tuple[Resi
             jacobian=lambda: _antenna_jacobian(at, config),
             slow_jacobian=lambda: -np.eye(3),
             constant_jacobians=lambda: _by_constants(at, config),
-            prior=1.0,
             size_m=math.hypot(raw[0], raw[1]),
-            size_deg=None,
             expected_nis=float((white.diagonal() / cov.diagonal())[: 3 if m.has_height else 2].sum()),
         ),
     )

@@ -48,9 +48,7 @@ def residuals(m: HeightPrior, config: HeightConfig, at: Attachment) -> tuple[Res
             cov=np.array([[m.sigma_m**2]]),
             jacobian=jacobian,
             slow_jacobian=lambda: -np.eye(1),
-            prior=1.0,
             size_m=float(abs(raw[0])),
-            size_deg=None,
         ),
     )
 

@@ -73,9 +73,6 @@ def residuals(m: GnssVelocity, config: VelocityConfig, at: Attachment) -> tuple[
         velocity_jacobian=lambda: to_local,
         slow_jacobian=lambda: -np.eye(3),
         constant_jacobians=lambda: _by_constants(at, config, to_local),
-        prior=1.0,
-        size_m=None,
-        size_deg=None,
     )
     return (plain if at.slow_walk is None else walked(plain, at.walked()),)
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Assess an IMU: units, gravity, standstill, noise and mount."""
+"""Assess an IMU: units, gravity, standstill, noise; its mount (`_assess_mount`), corrected by how it turns."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,11 +12,23 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
-from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, wrap_angle, yaw_from_rotation
+from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, yaw_from_rotation
 from graphloc.frontends import _clock
-from graphloc.frontends._assess import Courses, MeasuredMotion, attitudes, vec
+from graphloc.frontends._assess import MeasuredMotion, attitudes, vec
+from graphloc.frontends._assess_mount import (
+    ImuEvidence,
+    ImuSamples,
+    in_place_of,
+    levelling,
+    measured_mount,
+    mount_guess,
+    mount_turned,
+    mount_yaw,
+    tilt_of,
+    yawed,
+)
 from graphloc.frontends._mount_yaw import Felt, yaw_in_craft
-from graphloc.frontends._reports import CompassReport, ImuReport, MountGuess, Vec
+from graphloc.frontends._reports import ImuReport
 from graphloc.frontends._sanity import (
     HALF,
     NEVER_STILL_RADPS,
@@ -27,7 +39,6 @@ from graphloc.frontends._sanity import (
     slow_warning,
 )
 from graphloc.frontends._streams import TopicData
-from graphloc.frontends._tf import Pose, StaticTree
 from graphloc.frontends._turns import Yaws, unit_of_turns
 from graphloc.frontends.turning import Turning, course_against_turning, left_of_turns
 from graphloc.measurements import ImuSeries
@@ -45,15 +56,6 @@ _UPSIDE_DOWN_DEG = 150.0
 # Least number of quiet seconds in a row at standstill; a craft that only changes between ahead and astern is slow for a
 # shorter time than the second.
 _QUIET_S, _STANDS_S = 2, 1.5
-# Angle between gravity and body z from which a note says so; how near 90 deg gravity or the motion must be off to
-# overrule tf; and the coherence that this takes of the motion.
-_TILTED_DEG, _QUARTER_DEG, _OVERRULES = 20.0, 20.0, 0.6
-_SLIGHTLY_DEG = 3.0  # deviation from a multiple of 90 deg from which it is said
-_ASKEW_DEG = 15.0  # deviation from which an IMU sits askew: leeway, or an antenna far ahead, make less
-_EITHER = 0.5**0.5  # 1 sigma about one of two angles that are as likely, by how far they are apart
-_AHEAD_DEG = 60.0  # yaw within which an unclear motion says that x is ahead rather than astern or aside
-_CAMERA = -0.7  # z component of y, levelled, below which the axes are a camera's (y down)
-_ON_ITS_HEAD = -0.7  # z component of the upward axis below which a sensor is upside down, however it is tilted
 
 
 def samples_of(imu: TopicData) -> tuple[NDArray[np.intp], list[str]]:
@@ -63,146 +65,6 @@ def samples_of(imu: TopicData) -> tuple[NDArray[np.intp], list[str]]:
     keep = keep[np.argsort(imu.stamps_ns[keep], kind="stable")]
     bad = frozen_samples(imu.stamps_ns[keep], imu.rows[keep, :6] if len(keep) else np.zeros((0, 6)))
     return keep[~bad], frozen_imu_warning(imu.topic, imu.stamps_ns[keep], bad)
-
-
-class _Samples(NamedTuple):
-    """Usable samples of an IMU: frame, stamps (N,), accelerations (N, 3), m/s^2, and angular rates (N, 3), rad/s."""
-
-    frame_id: str
-    stamps_ns: NDArray[np.int64]
-    accel: Array
-    gyro: Array
-
-    def turned(self, R: Array) -> _Samples:
-        """Return the samples in other axes, to which R (3, 3) takes."""
-        return self._replace(accel=self.accel @ R.T, gyro=self.gyro @ R.T)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ImuEvidence:
-    """What an IMU is judged by.
-
-    Attributes:
-        motions: how the craft moved, by each source, the most accurate first.
-        courses: of the fixes; None without fixes. tree: transforms of /tf_static.
-        yaws: by topic, of odometry and poses.
-    """
-
-    motions: Sequence[MeasuredMotion]
-    courses: Courses | None
-    tree: StaticTree
-    yaws: Mapping[str, Yaws] = field(default_factory=dict)
-
-    def pose_of(self, frame: str | None) -> Pose | None:
-        """Return T_body_frame by tf; None where it does not know the frame."""
-        return self.tree.resolve(self.tree.body(), frame) if frame in self.tree.frames else None
-
-
-def _mount_guess(samples: _Samples, evidence: ImuEvidence) -> MountGuess:
-    """Return the IMU's mount in body: from tf, else levelled by gravity and aligned with the motion.
-
-    Some drivers publish in axes of their own, though under the frame of the URDF. Where tf is off by a quarter turn,
-    gravity or the motion overrules it. Half a turn about the vertical may be a craft that goes astern, so tf stays.
-    """
-    motions, pose = evidence.motions, evidence.pose_of(samples.frame_id)
-    if pose is None:
-        return _measured_mount(samples, motions)
-    tilt_deg = _tilt_deg(pose[1], samples.accel)
-    if abs(tilt_deg - 90.0) < _QUARTER_DEG:
-        return _in_place_of(pose, tilt_deg, _measured_mount(samples, motions))
-    note = "" if tilt_deg < _TILTED_DEG else f"; but then gravity is {tilt_deg:.0f} deg off body z: check it"
-    if not note and motions:
-        in_body = samples.turned(pose[1])
-        turned = yaw_in_craft(in_body.stamps_ns, in_body.accel, in_body.gyro, motions)
-        if turned is not None and turned.astray:
-            if abs(abs(turned.yaw_deg) - 90.0) < _QUARTER_DEG and turned.coherence > _OVERRULES:
-                said = f"not as in tf, since {turned.said}: tf is right only if the craft goes sideways throughout"
-                return replace(_turned(samples, motions, pose[1], said), xyz_m=vec(pose[0]))
-            note = f"; but {turned.said}: check it"
-    rpy = vec(np.degrees(rpy_from_rotation(pose[1])))
-    return MountGuess(rpy_deg=rpy, tf_frame=samples.frame_id, evidence=f"from tf{note}")
-
-
-def _measured_mount(samples: _Samples, motions: Sequence[MeasuredMotion]) -> MountGuess:
-    """Return the mount whose roll and pitch are by gravity, and whose yaw is by the motion."""
-    up = np.median(samples.accel, axis=0)
-    size = float(np.linalg.norm(up))
-    if size < 0.5 * STANDARD_GRAVITY_MPS2:
-        return _turned(samples, motions, np.eye(3), "no gravity to find the level from: taken as level")
-    axis = up / size
-    snapped = np.zeros(3)
-    k = int(np.argmax(np.abs(axis)))
-    snapped[k] = np.sign(axis[k])
-    aligned = float(axis @ snapped) > np.cos(np.radians(15.0))
-    level = _level(snapped if aligned else axis)
-    name = f"{'+' if snapped[k] > 0 else '-'}{'xyz'[k]}"
-    said = (
-        f"gravity is on {name} of the sensor" if aligned else f"gravity is {np.round(axis, 2).tolist()} in the sensor"
-    )
-    off_deg = float(np.degrees(np.arccos(np.clip(axis @ snapped, -1.0, 1.0))))
-    if not aligned or off_deg < _SLIGHTLY_DEG:
-        return _turned(samples, motions, level, said)
-    mount = _turned(samples, motions, level, f"{said}, {off_deg:.0f} deg off")
-    turn = rotation_from_rpy_deg(np.array(mount.rpy_deg)) @ level.T
-    roll, pitch, yaw = np.degrees(rpy_from_rotation(turn @ _level(axis))).tolist()
-    square = f"drafted in steps of 90 deg: if the sensor is tilted in the craft, rather than the craft itself, set [{roll:.1f}, {pitch:.1f}, {yaw:.1f}]"
-    return replace(mount, evidence=f"{mount.evidence}; {square}", tilt_sigma_deg=off_deg * _EITHER)
-
-
-def _tilt_deg(R_body_imu: Array, accel: Array) -> float:
-    """Return the angle of gravity, by accelerations (N, 3) and a mount, to body z, deg; 0 if gravity was removed."""
-    up = np.median(accel, axis=0)
-    size = float(np.linalg.norm(up))
-    return float(np.degrees(np.arccos(np.clip((R_body_imu @ up)[2] / size, -1.0, 1.0)))) if size > 2.0 else 0.0
-
-
-def _in_place_of(pose: tuple[Array, Array], tilt_deg: float, mount: MountGuess) -> MountGuess:
-    """Return a measured mount that replaces the one in tf, of which only the position is kept."""
-    why = f"not as in tf, by which gravity is {tilt_deg:.0f} deg off body z; {mount.evidence}"
-    return replace(mount, xyz_m=vec(pose[0]), evidence=why)
-
-
-def _rpy_deg(R: Array) -> Vec:
-    """Return roll, pitch and yaw of a rotation (3, 3), deg, rounded to a tenth."""
-    return vec(np.round(np.degrees(rpy_from_rotation(R)), 1) + 0.0)  # + 0.0: no -0.0
-
-
-def _turned(samples: _Samples, motions: Sequence[MeasuredMotion], level: Array, said: str) -> MountGuess:
-    """Return the mount of a sensor that is levelled by `level` (3, 3), with its yaw by the motion.
-
-    Args:
-        said: evidence of the level, in words.
-    """
-    yaw, sigma, evidence = _mount_yaw(samples.turned(level), motions)
-    told = yaw is not None
-    if yaw is None:
-        ahead = level[:, 2] if level[2, 1] < _CAMERA else np.array([1.0, 0.0, 0.0])
-        yaw = float(np.degrees(np.arctan2(-ahead[1], ahead[0]))) + 0.0
-        evidence += f": taken as {yaw:.0f}" + ("" if yaw == 0.0 else ", z ahead and y down as in a camera's axes")
-    turn = Rotation.from_euler("z", yaw, degrees=True).as_matrix()
-    rpy = _rpy_deg(turn @ level)
-    return MountGuess(rpy_deg=rpy, tf_frame=None, evidence=f"{said}; {evidence}", yaw_told=told, yaw_sigma_deg=sigma)
-
-
-def turned_as_its_heading(imu: ImuReport, compasses: Sequence[CompassReport]) -> ImuReport:
-    """Return the report with the mount's yaw by the IMU's own orientation, where nothing else tells it.
-
-    The orientation must be along the course or opposite to it. One a quarter turn off it tells nothing: so are headings
-    that count from north, or that are in other axes than the driver names.
-    """
-    own = next((c for c in compasses if c.topic == imu.topic and (c.ahead or c.backwards)), None)
-    if own is None or imu.mount.yaw_told:
-        return imu
-    R = rotation_from_rpy_deg(np.array(imu.mount.rpy_deg))
-    x_deg = float(np.degrees(np.arctan2(R[1, 0], R[0, 0])))
-    quarters = round(((180.0 if own.backwards else 0.0) - x_deg) / 90.0) % 4
-    if quarters == 0:
-        return imu
-    turn = Rotation.from_euler("z", 90.0 * quarters, degrees=True).as_matrix()
-    rpy = _rpy_deg(turn @ R)
-    turned = "half a turn" if quarters == 2 else "a quarter turn"
-    said = f"{imu.mount.evidence}, but {turned} off that, as its orientation is {own.offset_deg:+.0f} deg off the GNSS course"
-    return replace(imu, mount=replace(imu.mount, rpy_deg=rpy, evidence=said, yaw_told=True))
 
 
 def turned_as_headed(
@@ -218,67 +80,13 @@ def turned_as_headed(
     """
     if report.mount.yaw_told or not headed:
         return report
-    in_body = _Samples(imu.frame_id, *_in_body(_series_of(imu, report), report, evidence))
-    yaw, sigma, said = _mount_yaw(in_body, headed)
+    in_body = ImuSamples(imu.frame_id, *_in_body(_series_of(imu, report), report, evidence))
+    yaw, sigma, said = mount_yaw(in_body, headed)
     if yaw is None:
         return report
-    R = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ rotation_from_rpy_deg(np.array(report.mount.rpy_deg))
-    rpy = _rpy_deg(R)
+    rpy = yawed(yaw, rotation_from_rpy_deg(np.array(report.mount.rpy_deg)))
     told = f"{report.mount.evidence}; but from there {said}"
     return replace(report, mount=replace(report.mount, rpy_deg=rpy, evidence=told, yaw_told=True, yaw_sigma_deg=sigma))
-
-
-def _level(axis: Array) -> Array:
-    """Return the smallest rotation (3, 3) that takes a unit vector to +z.
-
-    Of a sensor upside down, it follows half a turn about x, so that x stays ahead. Near -z the axis of the smallest
-    rotation is arbitrary: of a sensor upside down and tilted a little forward, x would point astern.
-    """
-    turned = np.diag([1.0, -1.0, -1.0]) if axis[2] < _ON_ITS_HEAD else np.eye(3)
-    up, z = turned @ axis, np.array([0.0, 0.0, 1.0])
-    cross = np.cross(up, z)
-    sine = float(np.linalg.norm(cross))
-    if sine < 1e-9:
-        return turned
-    angle = float(np.arctan2(sine, up[2]))
-    return np.asarray(Rotation.from_rotvec(angle * cross / sine).as_matrix() @ turned)
-
-
-def _mount_yaw(levelled: _Samples, motions: Sequence[MeasuredMotion]) -> tuple[float | None, float, str]:
-    """Return the yaw of a levelled IMU by the motion, its sigma, and the evidence in words.
-
-    Returns:
-        The yaw, deg: a multiple of 90 unless the motion clearly contradicts it; None where nothing tells it. Its 1
-        sigma, deg, if it may be no multiple of 90; else 0. The evidence.
-    """
-    if not motions:
-        return None, 0.0, "no motion to find its yaw from"
-    found = yaw_in_craft(levelled.stamps_ns, levelled.accel, levelled.gyro, motions)
-    if found is None:
-        return None, 0.0, "too little motion to find its yaw from"
-    quarter = 90.0 * round(found.yaw_deg / 90.0)
-    stays = found.hints and abs(found.yaw_deg) < _AHEAD_DEG
-    if not found.clear and (found.likely or stays):
-        yaw = float(np.degrees(wrap_angle(np.radians(quarter)))) + 0.0 if found.likely else 0.0
-        said = f"yaw by the motion of {found.source}: {found.yaw_deg:z.0f} deg, but not clearly (coherence {found.coherence:.2f})"
-        return yaw, 0.0, f"{said}: taken as {yaw:.0f}"
-    if not found.clear:
-        return None, 0.0, f"motion of {found.source} does not show its yaw (coherence {found.coherence:.2f})"
-    off_deg = abs(found.yaw_deg - quarter)
-    turned = off_deg > max(_ASKEW_DEG, 4.0 * found.sigma_deg)
-    askew = turned and not found.one_way
-    yaw = float(np.degrees(wrap_angle(np.radians(round(found.yaw_deg) if askew else quarter)))) + 0.0
-    said = f"yaw by the motion of {found.source}: {found.yaw_deg:z.0f} deg (coherence {found.coherence:.2f})"
-    if turned and found.one_way:
-        said += (
-            f", taken as {yaw:.0f}: she goes one way, so leeway or a current may set her by that; where she is not set sideways, as "
-            f"on wheels, set {found.yaw_deg:.0f}"
-        )
-        return yaw, off_deg * _EITHER, said
-    if not askew and off_deg > max(_SLIGHTLY_DEG, 4.0 * found.sigma_deg):
-        said += f", taken as {yaw:.0f}, since leeway makes a few degrees: where she is not set sideways, as on wheels, set {found.yaw_deg:.0f}"
-        return yaw, off_deg * _EITHER, said
-    return yaw, found.error_deg if askew else 0.0, said
 
 
 class Inertial(NamedTuple):
@@ -352,13 +160,13 @@ def _turning_axis(imu: TopicData, report: ImuReport, evidence: ImuEvidence) -> A
     course, left = np.unwrap(courses.course_rad), []
     axes = np.vstack([np.eye(3), -np.eye(3)])
     for axis in axes:
-        mount = replace(report.mount, rpy_deg=vec(np.degrees(rpy_from_rotation(_level(axis)))))
+        mount = replace(report.mount, rpy_deg=vec(np.degrees(rpy_from_rotation(levelling(axis)))))
         turning = _turning_of(imu, replace(report, mount=mount), evidence)
         left.append(left_of_turns(turning, courses.stamps_ns, course))
     return axes[int(np.argmin(left))] if min(left) < _LEFT_OF_TURNS else None
 
 
-def _righted(report: ImuReport, imu: TopicData, samples: _Samples, evidence: ImuEvidence) -> ImuReport:
+def _righted(report: ImuReport, imu: TopicData, samples: ImuSamples, evidence: ImuEvidence) -> ImuReport:
     """Return the report corrected by how the gyroscope turns beside the courses of the fixes.
 
     Levelled by accelerations of the wrong sign, a sensor comes out upside down, and its gyroscope turns against the
@@ -374,14 +182,14 @@ def _righted(report: ImuReport, imu: TopicData, samples: _Samples, evidence: Imu
         why = (
             f"its gyro turns about {name} as the courses of the fixes do: taken for up, as there is no gravity to tell"
         )
-        return replace(report, mount=_turned(samples, motions, _level(up), why))
+        return replace(report, mount=mount_turned(samples, motions, levelling(up), why))
     sense = _against_courses(imu, report, evidence)
     if sense == 0:
         return report
     against = "its gyro turns against the courses of the fixes"
     if pose is None and sense < 0:
         why = f"{against}: its accelerations look inverted, or its axes are left-handed; or the fixes have latitude and longitude swapped"
-        mount = _mount_guess(samples._replace(accel=-samples.accel), evidence)
+        mount = mount_guess(samples._replace(accel=-samples.accel), evidence)
         mount = replace(mount, evidence=f"with accelerations inverted, {mount.evidence}")
         return replace(report, gravity="inverted", mount=mount, why=(*report.why, why))
     if pose is None:
@@ -389,7 +197,7 @@ def _righted(report: ImuReport, imu: TopicData, samples: _Samples, evidence: Imu
     up = np.asarray(pose[1]) @ np.median(samples.accel, axis=0)
     upside_down = float(up[2]) < np.cos(np.radians(_UPSIDE_DOWN_DEG)) * float(np.linalg.norm(up))
     if sense < 0 and upside_down and report.gravity == "included":
-        mount = _in_place_of(pose, _tilt_deg(pose[1], samples.accel), _measured_mount(samples, motions))
+        mount = in_place_of(pose, tilt_of(pose[1], samples.accel), measured_mount(samples, motions))
         return replace(report, mount=mount, why=(*report.why, f"{against}: the mount in tf is upside down"))
     if sense < 0:
         why = f"{against}: the mount in tf is upside down, or its axes are left-handed; check both"
@@ -430,7 +238,7 @@ def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
         variance = float(np.median(rows[:, column]))
         return float(np.sqrt(variance)) * root_dt / unit if np.isfinite(variance) and variance > 0.0 else None
 
-    samples = _Samples(imu.frame_id, stamps, accel, gyro)
+    samples = ImuSamples(imu.frame_id, stamps, accel, gyro)
     ug, mdps = 1e-6 * STANDARD_GRAVITY_MPS2, np.radians(1e-3)
     report = ImuReport(
         topic=imu.topic,
@@ -453,7 +261,7 @@ def imu_report(imu: TopicData, evidence: ImuEvidence) -> ImuReport | None:
         gyro_noise_mdps=float(white_noise(gyro).max()) * root_dt / mdps,
         reported_accel_ug=reported(10, ug),
         reported_gyro_mdps=reported(11, mdps),
-        mount=_mount_guess(samples, evidence),
+        mount=mount_guess(samples, evidence),
         fast=units.fast,
         missing=missing,
         unfinite=int((~finite).sum()),

@@ -57,12 +57,12 @@ def _tells(stream: TopicData, column: int) -> bool:
     return len(along) > FEWEST and float(np.sqrt((along**2).mean())) > _STILL_MPS
 
 
-def side_of(felt: Felt, stream: TopicData, R_body_sensor: Array | None = None) -> Side | None:
+def side_of(felt: Felt, stream: TopicData, R_body_sensor: Array | None) -> Side | None:
     """Return the side to which y of a log points, whose x points ahead; None if that is not clear.
 
     Args:
         felt: of an IMU in the axes of the vessel. stream: has velocities in its last three columns.
-        R_body_sensor: (3, 3), rotation of its axes by tf.
+        R_body_sensor: (3, 3), rotation of its axes by tf; None: unknown.
     """
     keep = sane(stream, np.s_[-3:-1])
     v = np.nan_to_num(stream.rows[keep, -3:])

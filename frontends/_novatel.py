@@ -12,7 +12,7 @@ from math import cos, radians, sin
 from typing import Any
 
 from graphloc.frontends._rejections import Rejection, rejected
-from graphloc.frontends._vendor_said import (
+from graphloc.frontends._said import (
     Part,
     SaidHeading,
     SaidPlace,

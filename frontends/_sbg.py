@@ -10,7 +10,7 @@ from math import degrees
 from typing import Any
 
 from graphloc.frontends._rejections import Rejection, rejected
-from graphloc.frontends._vendor_said import (
+from graphloc.frontends._said import (
     Part,
     SaidHeading,
     SaidInertial,

@@ -18,8 +18,8 @@ from graphloc.frames import Array
 from graphloc.frontends import nmea
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import FILTER, WATER, bare_topic
+from graphloc.frontends._said import Part, Said, SaidAlong, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._vendor_said import Part, Said, SaidAlong, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
 from graphloc.frontends.decode import (
     GPS_FIXES,
     IMU,
@@ -102,45 +102,38 @@ _ELSEWHERE = re.compile(
 _HEADING = re.compile(r"head|hdg|hdt|yaw|compass|azimuth", re.IGNORECASE)  # a topic of bare numbers may be a heading
 
 
-def _nmea_fix(text: str, wanted: str) -> Row | None:
+def _nmea_place(text: str, wanted: str) -> SaidPlace | Rejection:
     said = nmea.fix(text, [wanted])
     if isinstance(said, Rejection):
-        return None if said.outcome is Outcome.MALFORMED else (np.nan, np.nan, np.nan, -1.0, 0.0, 0.0, 0.0, 0.0)
-    # Only the qualities of RTK imply a sigma; other fixes are as a NavSatFix without a covariance (kind 0).
-    horizontal, vertical = nmea_sigmas_m(said, (0.0, 0.0))
-    status = NMEA_STATUS.get(said.quality, 0)
-    place = (said.latitude_deg, said.longitude_deg, said.height_m)
-    return (*place, status, float(horizontal > 0.0), horizontal**2, horizontal**2, vertical**2)
+        return said
+    sigmas_m = nmea_sigmas_m(said, (0.0, 0.0))  # only the qualities of RTK imply one
+    return SaidPlace(said.latitude_deg, said.longitude_deg, said.height_m, NMEA_STATUS.get(said.quality, 0), *sigmas_m)
 
 
-def _nmea_heading(text: str, wanted: str) -> Row | None:
+def _nmea_heading(text: str, wanted: str) -> SaidHeading | Rejection:
     said = nmea.heading_deg(text, [wanted])
-    if isinstance(said, Rejection) and said.outcome is Outcome.MALFORMED:
-        return None
-    half = np.nan if isinstance(said, Rejection) else np.radians(90.0 - said) / 2.0
-    return (0.0, 0.0, float(np.sin(half)), float(np.cos(half)))
+    return said if isinstance(said, Rejection) else SaidHeading(float(np.radians(90.0 - said)))
 
 
-def _nmea_velocity(text: str, wanted: str) -> Row | None:
+def _nmea_velocity(text: str, wanted: str) -> SaidVelocity | Rejection:
     said = nmea.velocity_mps(text, [wanted])
-    if isinstance(said, Rejection) and said.outcome is Outcome.MALFORMED:
-        return None
-    return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (*said, 0.0)
+    return said if isinstance(said, Rejection) else SaidVelocity((*said, 0.0))
 
 
-def _nmea_speed(text: str, wanted: str, through: str = "ground") -> Row | None:
+def _nmea_speed(text: str, wanted: str, through: str = "ground") -> SaidVelocity | Rejection:
     said = nmea.log_velocity_mps(text, [wanted], through)
-    if isinstance(said, Rejection) and said.outcome is Outcome.MALFORMED:
-        return None
-    return (np.nan, np.nan, np.nan) if isinstance(said, Rejection) else (*said, *(0.0,) * (3 - len(said)))
+    if isinstance(said, Rejection):
+        return said
+    ahead, port = (*said, 0.0)[:2]
+    return SaidVelocity((ahead, port, 0.0))
 
 
-# By sentence: the message type of the same content, and a function that returns its row, None if it is damaged.
-SENTENCES: dict[str, tuple[str, Callable[[str, str], Row | None]]] = {
-    **dict.fromkeys(nmea.HEADINGS, (QUATERNION, _nmea_heading)),
-    "VTG": (TWIST, _nmea_velocity),
-    **dict.fromkeys(nmea.SPEEDS, (TWIST, _nmea_speed)),
-    **dict.fromkeys(nmea.PLACES, (NAV_SAT_FIX, _nmea_fix)),
+# By sentence: the kind of sensor that reads it, and what it says.
+SENTENCES: dict[str, tuple[str, Callable[[str, str], Said | Rejection]]] = {
+    **dict.fromkeys(nmea.HEADINGS, ("compass", _nmea_heading)),
+    "VTG": ("gnss_velocity", _nmea_velocity),
+    **dict.fromkeys(nmea.SPEEDS, ("body_velocity", _nmea_speed)),
+    **dict.fromkeys(nmea.PLACES, ("gnss", _nmea_place)),
 }
 _SATELLITES = re.compile("(G[A-Z]|BD)[A-Z]{3}")  # a talker ID that names the satellite systems of a receiver
 # Sentences of two talkers that are recorded less than so many steps apart are of the same moment; the largest share of
@@ -152,7 +145,7 @@ _DAY_S, _FEWEST_TIMES = 86_400.0, 20
 _AS_OFTEN = 0.8
 COURSE, HEADING = " (course, speed)", " (heading)"
 """Endings of the names of streams: what RMC, a GPSFix or a maker's message says beside a place."""
-# By kind of a part of makers' messages: the message type of the same content, and a row without a value.
+# By kind of sensor, of what NMEA and makers' messages say: the message type of the same content, and a row without a value.
 _LIKE: dict[str, tuple[str, Row]] = {
     "imu": (IMU, (*[np.nan] * 6, *[0.0] * 4, 0.0, 0.0, -1.0)),
     "gnss": (NAV_SAT_FIX, (np.nan, np.nan, np.nan, -1.0, 0.0, 0.0, 0.0, 0.0)),
@@ -162,8 +155,11 @@ _LIKE: dict[str, tuple[str, Row]] = {
 }
 
 
-def _said_row(said: Said) -> Row:
+def _row_of(said: Said | Rejection, kind: str) -> Row | None:
+    """Return the row of what a sentence or a maker's message says to a kind of sensor; None if it is damaged."""
     match said:
+        case Rejection():
+            return None if said.outcome is Outcome.MALFORMED else _LIKE[kind][1]
         case SaidInertial():
             return (*said.accel_mps2, *said.gyro_radps, *_LIKE["imu"][1][6:])
         case SaidPlace():
@@ -173,8 +169,9 @@ def _said_row(said: Said) -> Row:
             return said.v_mps
         case SaidHeading():
             return (0.0, 0.0, float(np.sin(said.angle_rad / 2.0)), float(np.cos(said.angle_rad / 2.0)))
-        case SaidAlong():  # from ahead, to starboard, down to ahead, to port, up
-            return (said.v_mps[0], -said.v_mps[1], -said.v_mps[2])
+        case SaidAlong():
+            ahead, starboard, down = said.v_mps
+            return (ahead, -starboard, -down)  # to port, up
 
 
 _MOST = 1e12  # no measurement in SI units, geodetic or of a map grid is larger
@@ -239,14 +236,14 @@ class TopicData:
         """Return several streams of one type as one, with messages in the order of recording."""
         whole = cls(topic, parts[0].msgtype, parts[0].frame_id, sum(p.undecodable for p in parts))
         whole.frames = sum((p.frames for p in parts), Counter())
-        messages = [
-            message
-            for p in parts
-            for message in zip(p.stamps_ns.tolist(), p.logs_ns.tolist(), p.tuples, p.files, p.elapsed, strict=True)
-        ]
-        for stamp_ns, log_ns, row, file, elapsed_ns in sorted(messages, key=lambda message: message[1]):
-            whole.add(stamp_ns, log_ns, row, file, elapsed_ns)
+        messages = (message for p in parts for message in zip(*p.columns(), strict=True))
+        for message in sorted(messages, key=lambda message: message[1]):
+            whole.add(*message)
         return whole
+
+    def columns(self) -> tuple[list[Any], ...]:
+        """Return what there is of each message: stamps, recording times, rows, files, times since the beginning."""
+        return self._stamps, self._logs, self.tuples, self.files, self.elapsed
 
     def settle(self) -> None:
         """Drop messages without a stamp, in place; where stamps do not tell the time, use recording times.
@@ -262,8 +259,7 @@ class TopicData:
         self.no_stamp = there.count(False)
         if not self.no_stamp:
             return
-        columns: tuple[list[Any], ...] = (self._stamps, self._logs, self.tuples, self.files, self.elapsed)
-        for column in columns:
+        for column in self.columns():
             column[:] = list(compress(column, there))
         self._anew()
 
@@ -571,13 +567,11 @@ def _said_of(part: Part, msg: Any, name: str, streams: dict[str, TopicData]) -> 
     Velocities through water have a stream of their own.
     """
     said = part.read(msg)
-    if isinstance(said, Rejection):
-        return streams[name], None if said.outcome is Outcome.MALFORMED else _LIKE[part.kind][1]
     if isinstance(said, SaidAlong) and said.through == "water":
         name += WATER
         streams.setdefault(name, TopicData(name, TWIST, part=part))
     streams[name].filtered += getattr(said, "filtered", False)
-    return streams[name], _said_row(said)
+    return streams[name], _row_of(said, part.kind)
 
 
 def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:
@@ -586,11 +580,12 @@ def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tupl
     text = nmea.text_of(msg)
     for talker, kind in nmea.identities(text):
         if kind in SENTENCES:
-            msgtype, row_of = SENTENCES[kind]
+            of, read = SENTENCES[kind]
             name = f"{topic} {talker}{kind}"
-            said.append((streams.setdefault(name, TopicData(name, msgtype)), row_of(text, talker + kind)))
-        if kind == "RMC" and (row := _nmea_velocity(text, talker + kind)) is not None:
+            stream = streams.setdefault(name, TopicData(name, _LIKE[of][0]))
+            said.append((stream, _row_of(read(text, talker + kind), of)))
+        if kind == "RMC" and (row := _row_of(_nmea_velocity(text, talker + kind), "gnss_velocity")) is not None:
             said.append((streams.setdefault(name + COURSE, TopicData(name + COURSE, TWIST)), row))
-        if kind == "VBW" and (row := _nmea_speed(text, talker + kind, "water")) is not None:
+        if kind == "VBW" and (row := _row_of(_nmea_speed(text, talker + kind, "water"), "body_velocity")) is not None:
             said.append((streams.setdefault(name + WATER, TopicData(name + WATER, TWIST)), row))
     return said

@@ -48,7 +48,7 @@ three correlation times of a wander."""
 _SCALE = 1.6
 Yaws = tuple[NDArray[np.int64], Array]  # stamps (N,), ns, and yaw (N,), rad
 _PART_DEG, _PART = 3.0, 3.0  # RMS from which a deviation is said: in deg, and as a multiple of the claimed sigma
-_LONG_S = 12.0  # time over which a change of course is no noise (as in `_assess_imu.py`)
+_LONG_S = 12.0  # time over which a change of course is no noise (as in `turning.py`)
 _UNIT, _UNIT_CLEAR, _BY_CHANCE = 2.3, 0.8, 5.0
 """Turns fit a unit if their ratio is right within this factor; they are clear from this correlation and this value
 of Student's t, which says how far the correlation is beyond chance."""

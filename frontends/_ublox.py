@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from graphloc.frontends._rejections import Rejection, rejected
-from graphloc.frontends._vendor_said import (
+from graphloc.frontends._said import (
     Part,
     SaidHeading,
     SaidPlace,

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoders by (sensor kind, message type): pure functions from message to measurement.
 
-A decoder returns what the message states, in the project's frames and units. It sets an uncertainty only if the message
-has none; floors, scales and kernels belong to the factors.
+A reader returns what a message says (`_said`), in the project's frames and units, and `measured` makes a measurement of
+it: the same checks for all messages of a kind of sensor. An uncertainty is set only if the message has none; floors, scales
+and kernels belong to the factors.
 """
 
 from __future__ import annotations
@@ -33,7 +34,16 @@ from graphloc.frames import Array, Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.frontends import nmea
 from graphloc.frontends._fixes import RTK_SIGMA_M
 from graphloc.frontends._rejections import Rejection, ignored, malformed, rejected
-from graphloc.frontends._vendor_said import Part, SaidAlong, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
+from graphloc.frontends._said import (
+    Part,
+    Said,
+    SaidAlong,
+    SaidHeading,
+    SaidInertial,
+    SaidPlace,
+    SaidPose,
+    SaidVelocity,
+)
 from graphloc.frontends.vendors import STAMPS, VENDORS
 from graphloc.measurements import (
     AXES,
@@ -73,6 +83,7 @@ NO_STAMP = "`stamps: recorded` of that sensor takes the recording time instead"
 
 _MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
 _STATUS_UNKNOWN = -2
+_NO_FIX = "no fix (STATUS_NO_FIX)"
 _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
 NMEA_STATUS = {2: 1, 9: 1, 4: 2, 5: 2}  # quality of GGA (differential, RTK) to NavSatStatus
 _RTK_SIGMAS_M = {4: (0.02, 0.04), 5: (0.3, 0.6)}  # by quality (fixed, float): horizontal, vertical; at a dilution of 1
@@ -99,6 +110,8 @@ Decoded = Measurement | ImuReading | Rejection
 # Message, stamp (ns), arrival number, sensor, configuration. Types of message and configuration depend on the row of
 # `DECODERS`, hence Any.
 Decoder = Callable[[Any, int, int, str, Any], Decoded]
+Reader = Callable[[Any, Any], Said | SaidPose | Rejection]
+"""From a message and the configuration of the sensor to what the message says."""
 
 
 def header_stamp_ns(msg: Any) -> int | None:
@@ -186,46 +199,27 @@ def nav_sat_status(status: int) -> int:
     return {18: 1, 33: 1, _STATUS_UNKNOWN: 0}.get(status, status)
 
 
-def _imu(msg: Any, _stamp_ns: int, _seq: int, _sensor: str, config: ImuConfig) -> Decoded:
+def _imu(msg: Any, _config: ImuConfig) -> SaidInertial | Rejection:
     a, w = msg.linear_acceleration, msg.angular_velocity
-    accel, gyro = (float(a.x), float(a.y), float(a.z)), (float(w.x), float(w.y), float(w.z))
+    said = SaidInertial((float(a.x), float(a.y), float(a.z)), (float(w.x), float(w.y), float(w.z)))
     for name, values, cov in (
-        ("linear_acceleration", accel, msg.linear_acceleration_covariance),
-        ("angular_velocity", gyro, msg.angular_velocity_covariance),
+        ("linear_acceleration", said.accel_mps2, msg.linear_acceleration_covariance),
+        ("angular_velocity", said.gyro_radps, msg.angular_velocity_covariance),
     ):
         if not any(values) and cov[0] == -1.0:
             return malformed(f"the driver says that {name} is absent ({name}_covariance[0] = -1)")
-    return _inertial(accel, gyro, config)
+    return said
 
 
-def _inertial(
-    accel: tuple[float, float, float], gyro: tuple[float, float, float], config: ImuConfig
-) -> ImuReading | Rejection:
-    """Return a sample in SI units, converted from the configured units and sign of gravity."""
-    if not all(map(isfinite, (*accel, *gyro))):
-        return malformed("acceleration or angular rate is NaN")
-    if max(map(abs, (*accel, *gyro))) > _MOST_INERTIAL:
-        return malformed(f"acceleration or angular rate is beyond {_MOST_INERTIAL:g}, which nothing measures")
-    k = STANDARD_GRAVITY_MPS2 if config.accel_unit == "g" else 1.0
-    k = -k if config.gravity == "inverted" else k
-    r = pi / 180.0 if config.gyro_unit == "deg/s" else 1.0
-    return ImuReading((k * accel[0], k * accel[1], k * accel[2]), (r * gyro[0], r * gyro[1], r * gyro[2]))
-
-
-def _gnss(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) -> Decoded:
-    status = nav_sat_status(int(msg.status.status))
-    if status < 0:
-        return rejected("no fix (STATUS_NO_FIX)")
-    if status < _MIN_STATUS[config.min_status]:
-        return rejected(f"fix status {status} is below min_status '{config.min_status}'")
-    place = float(msg.latitude), float(msg.longitude), float(msg.altitude)
+def _place(msg: Any, _config: GnssConfig) -> SaidPlace:
     cov = np.asarray(msg.position_covariance, dtype=float).reshape(3, 3)
     kind = int(msg.position_covariance_type)
     if kind == _COVARIANCE_UNKNOWN:
         cov = np.zeros((3, 3))
     elif kind != _COVARIANCE_KNOWN:
         cov = np.diag(np.diagonal(cov))  # 'approximated' and 'diagonal known' promise the diagonal only
-    return _placed(place, cov, stamp_ns, seq, sensor, config, status)
+    place = float(msg.latitude), float(msg.longitude), float(msg.altitude)
+    return SaidPlace(*place, nav_sat_status(int(msg.status.status)), covariance=cov)
 
 
 def nmea_sigmas_m(fix: nmea.Fix, default_m: tuple[float, float]) -> tuple[float, float]:
@@ -235,16 +229,15 @@ def nmea_sigmas_m(fix: nmea.Fix, default_m: tuple[float, float]) -> tuple[float,
     return dilution * horizontal, dilution * vertical
 
 
-def _gnss_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) -> Decoded:
+def _place_nmea(msg: Any, config: GnssConfig) -> SaidPlace | Rejection:
     fix = nmea.fix(nmea.text_of(msg), config.nmea)
     if isinstance(fix, Rejection):
         return fix
     status = NMEA_STATUS.get(fix.quality, 0)
     if status < _MIN_STATUS[config.min_status]:
         return rejected(f"quality {fix.quality} is below min_status '{config.min_status}'")
-    horizontal, vertical = nmea_sigmas_m(fix, (config.default_horizontal_sigma_m, config.default_vertical_sigma_m))
-    cov = np.diag([horizontal, horizontal, vertical]) ** 2
-    return _placed((fix.latitude_deg, fix.longitude_deg, fix.height_m), cov, stamp_ns, seq, sensor, config, status)
+    sigmas_m = nmea_sigmas_m(fix, (config.default_horizontal_sigma_m, config.default_vertical_sigma_m))
+    return SaidPlace(fix.latitude_deg, fix.longitude_deg, fix.height_m, status, *sigmas_m)
 
 
 @lru_cache(maxsize=8)
@@ -255,8 +248,8 @@ def _from_grid(grid: str) -> Transformer:
         raise ValueError(f"grid {grid} is not known") from None
 
 
-def _gnss_grid(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfig) -> Decoded:
-    """Decode the position of a pose in a map grid; its orientation is not used.
+def _place_grid(msg: Any, config: GnssConfig) -> SaidPlace | Rejection:
+    """Read the position of a pose in a map grid; its orientation is not used.
 
     The grid's north is off by a few degrees, by which the covariance is not turned.
     """
@@ -266,62 +259,7 @@ def _gnss_grid(msg: Any, stamp_ns: int, seq: int, sensor: str, config: GnssConfi
     longitude, latitude = _from_grid(config.grid).transform(x, y)
     if not np.isfinite([longitude, latitude]).all():
         return malformed(f"its position is not in the grid {config.grid}")
-    cov = (
-        covariance_translation_first(msg.pose.covariance)[:3, :3]
-        if hasattr(msg.pose, "covariance")
-        else np.zeros((3, 3))
-    )
-    return _placed((latitude, longitude, height), cov, stamp_ns, seq, sensor, config)
-
-
-def _placed(
-    place: tuple[float, float, float],
-    cov: Array,
-    stamp_ns: int,
-    seq: int,
-    sensor: str,
-    config: GnssConfig,
-    status: int = _MIN_STATUS["gbas"],
-) -> Decoded:
-    """Return a fix, or its rejection.
-
-    Args:
-        place: latitude and longitude, deg, and height, m, NaN if unknown. cov: (3, 3), m^2, east, north, up; zeros if
-            unknown. stamp_ns, seq, sensor, config: as of a decoder. status: as of NavSatStatus.
-    """
-    lat, lon, height = place
-    if not np.isfinite([lat, lon]).all():
-        return malformed("latitude or longitude is NaN")
-    planar = bool(np.isnan(height))  # NavSatFix: 'set to NaN if no altitude is available'
-    if planar:
-        height = 0.0
-    if not abs(height) <= _MOST_HEIGHT_M:
-        return malformed(f"height is beyond {_MOST_HEIGHT_M / 1e3:g} km")
-    if lat == 0.0 and lon == 0.0:
-        return rejected("position 0, 0: the receiver had none")
-    if abs(lat) > 90.0:
-        swapped = abs(lat) <= 360.0 and abs(lon) <= 90.0
-        return malformed("latitude is beyond 90 deg" + (": latitude and longitude look swapped" if swapped else ""))
-    if not -180.0 <= lon <= 360.0:
-        return malformed("longitude is beyond 180 deg")
-    default = np.array([config.default_horizontal_sigma_m] * 2 + [config.default_vertical_sigma_m]) ** 2
-    if planar:
-        cov = cov.copy()
-        cov[2, :] = cov[:, 2] = 0.0  # the message gives no height, so its claim on one does not count
-        default[2] = NO_HEIGHT_M2
-    if config.takes_turns:
-        rtk = is_rtk(status, cov)
-        if rtk != (config.fixes == "rtk"):
-            return ignored(
-                f"{'of RTK' if rtk else 'without RTK'}, by its status and what it states, and fixes is {config.fixes}"
-            )
-    return GnssPosition(
-        stamp_ns=stamp_ns,
-        sensor=sensor,
-        seq=seq,
-        position=Geodetic(lat, lon, height),
-        cov_enu_m2=usable_covariance(cov, default),
-    )
+    return SaidPlace(latitude, longitude, height, _MIN_STATUS["gbas"], covariance=_covariance_of(msg.pose)[:3, :3])
 
 
 def is_rtk(status: int, cov: Array) -> bool:
@@ -331,38 +269,32 @@ def is_rtk(status: int, cov: Array) -> bool:
     return status >= _MIN_STATUS["gbas"] and known and float(variance.max()) < RTK_SIGMA_M**2
 
 
-def _heading(orientation: Any, variance: float, stamp_ns: int, seq: int, sensor: str, config: CompassConfig) -> Decoded:
+def _heading(orientation: Any, variance: float, config: CompassConfig) -> SaidHeading | Rejection:
     yaw = yaw_of_x_axis(*(float(v) for v in (orientation.x, orientation.y, orientation.z, orientation.w)))
     if isinstance(yaw, Rejection):
         return yaw
     if config.convention == "ned":  # yaw is then the heading: clockwise from north
         yaw = float(wrap_angle(np.pi / 2.0 - yaw))
-    reported = config.use_reported_sigma and np.isfinite(variance) and variance > 0.0
-    sigma = float(np.sqrt(np.clip(variance, *_VARIANCES))) if reported else float(np.radians(config.sigma_deg))
-    return CompassHeading(stamp_ns=stamp_ns, sensor=sensor, seq=seq, yaw_rad=yaw, sigma_rad=sigma)
+    told = np.isfinite(variance) and variance > 0.0
+    return SaidHeading(yaw, float(np.sqrt(np.clip(variance, *_VARIANCES))) if told else 0.0)
 
 
-def _compass_quaternion(msg: Any, stamp_ns: int, seq: int, sensor: str, config: CompassConfig) -> Decoded:
-    return _heading(msg.quaternion, 0.0, stamp_ns, seq, sensor, config)
+def _heading_quaternion(msg: Any, config: CompassConfig) -> SaidHeading | Rejection:
+    return _heading(msg.quaternion, 0.0, config)
 
 
-def _compass_imu(msg: Any, stamp_ns: int, seq: int, sensor: str, config: CompassConfig) -> Decoded:
+def _heading_imu(msg: Any, config: CompassConfig) -> SaidHeading | Rejection:
     if msg.orientation_covariance[0] == -1.0:
         return rejected("the driver says that the orientation is absent (orientation_covariance[0] = -1)")
-    return _heading(msg.orientation, float(msg.orientation_covariance[8]), stamp_ns, seq, sensor, config)
+    return _heading(msg.orientation, float(msg.orientation_covariance[8]), config)
 
 
-def _compass_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: CompassConfig) -> Decoded:
+def _heading_nmea(msg: Any, config: CompassConfig) -> SaidHeading | Rejection:
     heading = nmea.heading_deg(nmea.text_of(msg), config.nmea)
-    if isinstance(heading, Rejection):
-        return heading
-    yaw = float(wrap_angle(np.radians(90.0 - heading)))
-    return CompassHeading(
-        stamp_ns=stamp_ns, sensor=sensor, seq=seq, yaw_rad=yaw, sigma_rad=float(np.radians(config.sigma_deg))
-    )
+    return heading if isinstance(heading, Rejection) else SaidHeading(float(wrap_angle(np.radians(90.0 - heading))))
 
 
-def _compass_number(msg: Any, stamp_ns: int, seq: int, sensor: str, config: CompassConfig) -> Decoded:
+def _heading_number(msg: Any, config: CompassConfig) -> SaidHeading | Rejection:
     angle = float(np.radians(msg.data)) if config.unit == "deg" else float(msg.data)
     if not isfinite(angle):
         return malformed("heading is NaN")
@@ -370,51 +302,46 @@ def _compass_number(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Comp
         return malformed(
             f"heading {float(msg.data):g} {config.unit} is beyond {MOST_TURNS} turns: is it in another unit?"
         )
-    yaw = float(wrap_angle(pi / 2.0 - angle if config.convention == "ned" else angle))
-    return CompassHeading(
-        stamp_ns=stamp_ns, sensor=sensor, seq=seq, yaw_rad=yaw, sigma_rad=float(np.radians(config.sigma_deg))
-    )
+    return SaidHeading(float(wrap_angle(pi / 2.0 - angle if config.convention == "ned" else angle)))
 
 
 def _twist(msg: Any) -> tuple[tuple[float, float, float], Array]:
     """Return the linear velocity of a message and its covariance (3, 3), zeros if it has none."""
-    with_covariance = hasattr(msg.twist, "covariance")
-    v = msg.twist.twist.linear if with_covariance else msg.twist.linear
-    cov = covariance_translation_first(msg.twist.covariance)[:3, :3] if with_covariance else np.zeros((3, 3))
-    return (v.x, v.y, v.z), cov
+    v = getattr(msg.twist, "twist", msg.twist).linear
+    return (v.x, v.y, v.z), _covariance_of(msg.twist)[:3, :3]
 
 
-def _velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
-    return _moving(*_up_if_told(*_in_enu(*_twist(msg), config)), stamp_ns, seq, sensor, config)
+def _vector(msg: Any) -> tuple[tuple[float, float, float], Array]:
+    """Return the same of a message that is a vector."""
+    return (msg.vector.x, msg.vector.y, msg.vector.z), np.zeros((3, 3))
 
 
-def _velocity_vector(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
-    v = msg.vector
-    return _moving(*_up_if_told(*_in_enu((v.x, v.y, v.z), np.zeros((3, 3)), config)), stamp_ns, seq, sensor, config)
+def _velocity(msg: Any, config: VelocityConfig) -> SaidVelocity:
+    v, cov = _vector(msg) if hasattr(msg, "vector") else _twist(msg)
+    said = _in_enu(SaidVelocity(v, covariance=cov), config)
+    return said._replace(v_mps=up_if_told(said.v_mps))
 
 
-def _up_if_told(v: tuple[float, float, float], cov: Array) -> tuple[tuple[float, float, float], Array]:
-    """Return a velocity, east, north, up, and its covariance; up is NaN where it is exactly 0.
+def up_if_told(v_mps: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return a velocity, east, north, up, whose up is NaN where it is exactly 0.
 
     So drivers of NMEA leave it in a standard message, with any covariance. A maker's message says what its receiver measured.
     """
-    return (*v[:2], v[2] or np.nan), cov
+    return (*v_mps[:2], v_mps[2] or np.nan)
 
 
-def _in_enu(
-    v: tuple[float, float, float], cov: Array, config: VelocityConfig
-) -> tuple[tuple[float, float, float], Array]:
-    """Return a velocity and its covariance in east, north, up."""
+def _in_enu(said: SaidVelocity, config: VelocityConfig) -> SaidVelocity:
+    """Return a velocity in the configured axes in east, north, up."""
     if config.convention == "enu":
-        return v, cov
-    return (v[1], v[0], -v[2]), _ENU_FROM_NED @ cov @ _ENU_FROM_NED.T
+        return said
+    north, east, down = said.v_mps
+    cov = None if said.covariance is None else _ENU_FROM_NED @ said.covariance @ _ENU_FROM_NED.T
+    return said._replace(v_mps=(east, north, -down), covariance=cov)
 
 
-def _velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
+def _velocity_nmea(msg: Any, config: VelocityConfig) -> SaidVelocity | Rejection:
     v = nmea.velocity_mps(nmea.text_of(msg), config.nmea)
-    if isinstance(v, Rejection):
-        return v
-    return _moving((*v, np.nan), np.zeros((3, 3)), stamp_ns, seq, sensor, config)
+    return v if isinstance(v, Rejection) else SaidVelocity((*v, np.nan))
 
 
 def gps_fix_velocity_mps(msg: Any) -> tuple[float, float, float] | Rejection:
@@ -424,7 +351,7 @@ def gps_fix_velocity_mps(msg: Any) -> tuple[float, float, float] | Rejection:
     of NMEA leave it so. The errors in the message are not used: drivers disagree on their meaning.
     """
     if nav_sat_status(int(msg.status.status)) < 0:
-        return rejected("no fix (STATUS_NO_FIX)")
+        return rejected(_NO_FIX)
     speed, track, climb = float(msg.speed), float(msg.track), float(msg.climb)
     if not isfinite(speed) or (speed > nmea.SLOW_MPS and not isfinite(track)):
         return rejected(f"no {'track' if isfinite(speed) else 'speed'}")
@@ -434,36 +361,9 @@ def gps_fix_velocity_mps(msg: Any) -> tuple[float, float, float] | Rejection:
     return float(speed * np.sin(angle)), float(speed * np.cos(angle)), climb or np.nan
 
 
-def _velocity_gps_fix(msg: Any, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig) -> Decoded:
+def _velocity_gps_fix(msg: Any, _config: VelocityConfig) -> SaidVelocity | Rejection:
     v = gps_fix_velocity_mps(msg)
-    if isinstance(v, Rejection):
-        return v
-    return _moving(v, np.zeros((3, 3)), stamp_ns, seq, sensor, config)
-
-
-def _moving(
-    v_mps: tuple[float, float, float], cov: Array, stamp_ns: int, seq: int, sensor: str, config: VelocityConfig
-) -> Decoded:
-    """Return a velocity over ground, horizontal where its up is NaN."""
-    value = np.array(v_mps, dtype=float)
-    default = np.full(3, config.default_sigma_mps**2)
-    if np.isnan(value[2]):
-        value[2], default[2] = 0.0, _NO_CLIMB_MPS2
-        cov = cov.copy()
-        cov[2], cov[:, 2] = 0.0, 0.0
-    if trouble := _no_velocity(value):
-        return trouble
-    return GnssVelocity(
-        stamp_ns=stamp_ns, sensor=sensor, seq=seq, v_enu_mps=value, cov_m2ps2=usable_covariance(cov, default)
-    )
-
-
-def _no_velocity(value: Array) -> Rejection | None:
-    if not np.isfinite(value).all():
-        return malformed("velocity is NaN")
-    if np.abs(value).max() > MOST_SPEED_MPS:
-        return malformed(f"velocity is beyond {MOST_SPEED_MPS:g} m/s")
-    return None
+    return v if isinstance(v, Rejection) else SaidVelocity(v)
 
 
 def no_lock(value: ArrayLike) -> bool:
@@ -472,43 +372,17 @@ def no_lock(value: ArrayLike) -> bool:
     return bool((np.abs(np.abs(value) - NO_LOCK_MPS) < 1e-5).any())
 
 
-def _body_velocity(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:
-    return _along(*_twist(msg), stamp_ns, seq, sensor, config)
+def _along(msg: Any, _config: BodyVelocityConfig) -> SaidAlong:
+    return SaidAlong(*(_vector(msg) if hasattr(msg, "vector") else _twist(msg)))
 
 
-def _body_velocity_vector(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:
-    v = msg.vector
-    return _along((v.x, v.y, v.z), np.zeros((3, 3)), stamp_ns, seq, sensor, config)
+def _along_number(msg: Any, config: BodyVelocityConfig) -> SaidAlong:
+    return SaidAlong((float(msg.data) * _UNIT_MPS[config.unit],), np.zeros((1, 1)))
 
 
-def _body_velocity_number(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:
-    speed = float(msg.data) * _UNIT_MPS[config.unit]
-    return _along((speed,), np.zeros((1, 1)), stamp_ns, seq, sensor, config)
-
-
-def _body_velocity_nmea(msg: Any, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig) -> Decoded:
+def _along_nmea(msg: Any, config: BodyVelocityConfig) -> SaidAlong | Rejection:
     v = nmea.log_velocity_mps(nmea.text_of(msg), config.nmea, config.through)
-    if isinstance(v, Rejection):
-        return v
-    return _along(v, np.zeros((len(v), len(v))), stamp_ns, seq, sensor, config)
-
-
-def _along(
-    v_mps: tuple[float, ...], cov: Array, stamp_ns: int, seq: int, sensor: str, config: BodyVelocityConfig
-) -> Decoded:
-    """Return the velocity along the configured axes of the sensor."""
-    axes = tuple(axis for axis in "xyz"[: len(v_mps)] if axis in config.axes)
-    if not axes:
-        return rejected(f"it tells the speed along x alone, and axes is [{', '.join(config.axes)}]")
-    picked = ["xyz".index(axis) for axis in axes]
-    value = np.array(v_mps, dtype=float)[picked]
-    if trouble := _no_velocity(value):
-        return trouble
-    if no_lock(value):
-        return rejected(f"it has no lock: a Doppler log's {NO_LOCK_MPS:g} m/s say so")
-    reported = cov[np.ix_(picked, picked)] if config.use_reported_sigma else np.zeros((len(axes), len(axes)))
-    usable = usable_covariance(reported, np.full(len(axes), config.sigma_mps**2))
-    return BodyVelocity(stamp_ns=stamp_ns, sensor=sensor, seq=seq, axes=axes, value=value, cov=usable)
+    return v if isinstance(v, Rejection) else SaidAlong(v, np.zeros((len(v), len(v))))
 
 
 def is_unit(quaternion: Array) -> bool:
@@ -516,14 +390,19 @@ def is_unit(quaternion: Array) -> bool:
     return bool((np.abs(quaternion) < 2.0).all()) and abs(float(np.linalg.norm(quaternion)) - 1.0) < 0.1
 
 
+def rotation_of(quaternion: ArrayLike) -> Array | None:
+    """Return the rotation (3, 3) of a quaternion (4,); None of an invalid one."""
+    quaternion = np.asarray(quaternion, dtype=float)
+    return np.asarray(Rotation.from_quat(quaternion).as_matrix()) if is_unit(quaternion) else None
+
+
 def pose_of(msg: Any) -> tuple[Array, Array | None]:
     """Return the position (3,) and rotation (3, 3) of a message of `POSE_TYPES`.
 
     The rotation is None if the message has no quaternion, or an invalid one.
     """
-    *place, x, y, z, w = pose_numbers(msg)
-    quaternion = np.array([x, y, z, w])
-    return np.array(place), np.asarray(Rotation.from_quat(quaternion).as_matrix()) if is_unit(quaternion) else None
+    numbers = pose_numbers(msg)
+    return np.array(numbers[:3]), rotation_of(numbers[3:])
 
 
 def pose_numbers(msg: Any) -> tuple[float, ...]:
@@ -538,85 +417,194 @@ def pose_numbers(msg: Any) -> tuple[float, ...]:
     return float(p.x), float(p.y), float(p.z), float(q.x), float(q.y), float(q.z), float(q.w)
 
 
-def _pose(msg: Any, stamp_ns: int, seq: int, sensor: str, config: PoseConfig) -> Decoded:
-    position, rotation = pose_of(msg)
+def _pose(msg: Any, config: PoseConfig) -> SaidPose | Rejection:
+    if hasattr(msg, "point") and any(AXES.index(a) > 2 for a in config.axes):
+        return malformed("a point has no orientation: set axes: [x, y, z]")
+    return SaidPose(*pose_of(msg), _covariance_of(getattr(msg, "pose", None)))
+
+
+def _covariance_of(part: Any) -> Array:
+    """Return the covariance (6, 6), translation first, of a part of a message; zeros if it has none."""
+    told = getattr(part, "covariance", None)
+    return np.zeros((6, 6)) if told is None else covariance_translation_first(told)
+
+
+def _by_maker(part: Part) -> Reader:
+    """Return the reader of one part of a maker's message."""
+
+    def read(msg: Any, config: Any) -> Said | Rejection:
+        said = part.read(msg)
+        if isinstance(said, SaidVelocity) and not part.told:
+            return _in_enu(said, config)
+        if isinstance(said, SaidHeading):
+            turned = not part.told and config.convention == "ned"
+            return said._replace(angle_rad=float(wrap_angle(pi / 2.0 - said.angle_rad if turned else said.angle_rad)))
+        return said
+
+    return read
+
+
+# From what a message says to a measurement
+
+
+def measured(said: Said | SaidPose | Rejection, stamp_ns: int, seq: int, sensor: str, config: Any) -> Decoded:
+    """Return the measurement of a sensor by what a message says, or why it is none.
+
+    Args:
+        said: in axes of world, of velocities and headings. stamp_ns, seq, sensor, config: as of a decoder.
+    """
+    of: dict[str, Any] = {"stamp_ns": stamp_ns, "seq": seq, "sensor": sensor}
+    match said:
+        case Rejection():
+            return said
+        case SaidInertial():
+            return _inertial(said, config)
+        case SaidPlace():
+            return _fix(said, config, of)
+        case SaidVelocity():
+            return _over_ground(said, config, of)
+        case SaidHeading():
+            sigma = (said.sigma_rad if config.use_reported_sigma else 0.0) or float(np.radians(config.sigma_deg))
+            return CompassHeading(**of, yaw_rad=said.angle_rad, sigma_rad=sigma)
+        case SaidAlong():
+            return _along_axes(said, config, of)
+        case SaidPose():
+            return _pose_fix(said, config, of)
+
+
+def _inertial(said: SaidInertial, config: ImuConfig) -> ImuReading | Rejection:
+    """Return a sample in SI units, converted from the configured units and sign of gravity."""
+    accel, gyro = said
+    if not all(map(isfinite, (*accel, *gyro))):
+        return malformed("acceleration or angular rate is NaN")
+    if max(map(abs, (*accel, *gyro))) > _MOST_INERTIAL:
+        return malformed(f"acceleration or angular rate is beyond {_MOST_INERTIAL:g}, which nothing measures")
+    k = STANDARD_GRAVITY_MPS2 if config.accel_unit == "g" else 1.0
+    k = -k if config.gravity == "inverted" else k
+    r = pi / 180.0 if config.gyro_unit == "deg/s" else 1.0
+    return ImuReading((k * accel[0], k * accel[1], k * accel[2]), (r * gyro[0], r * gyro[1], r * gyro[2]))
+
+
+def _fix(said: SaidPlace, config: GnssConfig, of: Mapping[str, Any]) -> Decoded:
+    lat, lon, height = said[:3]
+    if said.status < 0:
+        return rejected(_NO_FIX)
+    if said.status < _MIN_STATUS[config.min_status]:
+        return rejected(f"fix status {said.status} is below min_status '{config.min_status}'")
+    if not np.isfinite([lat, lon]).all():
+        return malformed("latitude or longitude is NaN")
+    planar = bool(np.isnan(height))  # NavSatFix: 'set to NaN if no altitude is available'
+    if planar:
+        height = 0.0
+    if not abs(height) <= _MOST_HEIGHT_M:
+        return malformed(f"height is beyond {_MOST_HEIGHT_M / 1e3:g} km")
+    if lat == 0.0 and lon == 0.0:
+        return rejected("position 0, 0: the receiver had none")
+    if abs(lat) > 90.0:
+        swapped = abs(lat) <= 360.0 and abs(lon) <= 90.0
+        return malformed("latitude is beyond 90 deg" + (": latitude and longitude look swapped" if swapped else ""))
+    if not -180.0 <= lon <= 360.0:
+        return malformed("longitude is beyond 180 deg")
+    cov = _covariance(said.covariance, said.horizontal_m, said.vertical_m)
+    default = np.array([config.default_horizontal_sigma_m] * 2 + [config.default_vertical_sigma_m]) ** 2
+    if planar:
+        cov[2, :] = cov[:, 2] = 0.0  # the message gives no height, so its claim on one does not count
+        default[2] = NO_HEIGHT_M2
+    if config.takes_turns:
+        rtk = is_rtk(said.status, cov)
+        if rtk != (config.fixes == "rtk"):
+            return ignored(
+                f"{'of RTK' if rtk else 'without RTK'}, by its status and what it states, and fixes is {config.fixes}"
+            )
+    return GnssPosition(**of, position=Geodetic(lat, lon, height), cov_enu_m2=usable_covariance(cov, default))
+
+
+def _covariance(told: Array | None, horizontal: float, vertical: float) -> Array:
+    """Return a covariance (3, 3), east, north, up, as it is told, or else by sigmas; one of its own to change."""
+    return np.diag([horizontal, horizontal, vertical]) ** 2 if told is None else np.array(told)
+
+
+def _over_ground(said: SaidVelocity, config: VelocityConfig, of: Mapping[str, Any]) -> Decoded:
+    """Return a velocity over ground, horizontal where its up is NaN."""
+    value, cov = np.array(said.v_mps, dtype=float), _covariance(said.covariance, said.horizontal_mps, said.vertical_mps)
+    default = np.full(3, config.default_sigma_mps**2)
+    if np.isnan(value[2]):
+        value[2], default[2] = 0.0, _NO_CLIMB_MPS2
+        cov[2], cov[:, 2] = 0.0, 0.0
+    if trouble := _no_velocity(value):
+        return trouble
+    return GnssVelocity(**of, v_enu_mps=value, cov_m2ps2=usable_covariance(cov, default))
+
+
+def _no_velocity(value: Array) -> Rejection | None:
+    if not np.isfinite(value).all():
+        return malformed("velocity is NaN")
+    if np.abs(value).max() > MOST_SPEED_MPS:
+        return malformed(f"velocity is beyond {MOST_SPEED_MPS:g} m/s")
+    return None
+
+
+def _along_axes(said: SaidAlong, config: BodyVelocityConfig, of: Mapping[str, Any]) -> Decoded:
+    """Return the velocity along the configured axes of the sensor."""
+    if said.through not in ("", config.through):
+        return ignored(f"its velocity is through the {said.through}, and through is {config.through}")
+    axes = tuple(axis for axis in "xyz"[: len(said.v_mps)] if axis in config.axes)
+    if not axes:
+        return rejected(f"it tells the speed along x alone, and axes is [{', '.join(config.axes)}]")
+    picked = ["xyz".index(axis) for axis in axes]
+    value = np.array(said.v_mps, dtype=float)[picked]
+    if trouble := _no_velocity(value):
+        return trouble
+    if no_lock(value):
+        return rejected(f"it has no lock: a Doppler log's {NO_LOCK_MPS:g} m/s say so")
+    cov = np.zeros((len(axes), len(axes)))
+    if config.use_reported_sigma:
+        cov = np.reshape(said.covariance, (len(said.v_mps), -1))[np.ix_(picked, picked)]
+    usable = usable_covariance(cov, np.full(len(axes), config.sigma_mps**2))
+    return BodyVelocity(**of, axes=axes, value=value, cov=usable)
+
+
+def _pose_fix(said: SaidPose, config: PoseConfig, of: Mapping[str, Any]) -> Decoded:
     picked = [AXES.index(a) for a in config.axes]
-    if rotation is None and max(picked) > 2:
-        alone = hasattr(msg, "point")
-        return malformed(
-            "a point has no orientation: set axes: [x, y, z]" if alone else "orientation is NaN or no unit quaternion"
-        )
-    angles = np.zeros(3) if rotation is None else rpy_from_rotation(rotation)
-    value = np.concatenate([position, angles])[picked]
+    if said.rotation is None and max(picked) > 2:
+        return malformed("orientation is NaN or no unit quaternion")
+    angles = np.zeros(3) if said.rotation is None else rpy_from_rotation(said.rotation)
+    value = np.concatenate([said.position_m, angles])[picked]
     if not np.isfinite(value).all():
         return malformed("position is NaN")
     if np.abs(value).max() > MOST_DISTANCE_M:
         return malformed(f"position is over {MOST_DISTANCE_M / 1e3:g} km from the datum")
     default = np.array([config.default_sigma_m] * 3 + [np.radians(config.default_sigma_deg)] * 3) ** 2
-    told = getattr(getattr(msg, "pose", None), "covariance", None)
-    cov = np.zeros((6, 6)) if told is None else covariance_translation_first(told)
-    cov = cov[np.ix_(picked, picked)]
-    mode = PoseMode(value=value, cov=usable_covariance(cov, default[picked]))
-    return PoseFix(stamp_ns=stamp_ns, sensor=sensor, seq=seq, axes=config.axes, modes=(mode,))
+    mode = PoseMode(value=value, cov=usable_covariance(said.covariance[np.ix_(picked, picked)], default[picked]))
+    return PoseFix(**of, axes=config.axes, modes=(mode,))
 
 
-def _by_maker(part: Part) -> Decoder:
-    """Return the decoder of one part of a maker's message."""
-
+def _decoder(read: Reader) -> Decoder:
     def decoder(msg: Any, stamp_ns: int, seq: int, sensor: str, config: Any) -> Decoded:
-        said = part.read(msg)
-        match said:
-            case Rejection():
-                return said
-            case SaidInertial():
-                return _inertial(*said, config)
-            case SaidPlace():
-                if said.status < _MIN_STATUS[config.min_status]:
-                    return rejected(f"fix status {said.status} is below min_status '{config.min_status}'")
-                cov = np.diag([said.horizontal_m, said.horizontal_m, said.vertical_m]) ** 2
-                return _placed(said[:3], cov, stamp_ns, seq, sensor, config, said.status)
-            case SaidVelocity():
-                cov = np.diag([said.horizontal_mps, said.horizontal_mps, said.vertical_mps]) ** 2
-                v, cov = (said.v_mps, cov) if part.told else _in_enu(said.v_mps, cov, config)
-                return _moving(v, cov, stamp_ns, seq, sensor, config)
-            case SaidHeading():
-                turned = not part.told and config.convention == "ned"
-                yaw = float(wrap_angle(pi / 2.0 - said.angle_rad if turned else said.angle_rad))
-                sigma = said.sigma_rad if config.use_reported_sigma else 0.0
-                sigma = sigma or float(np.radians(config.sigma_deg))
-                return CompassHeading(stamp_ns=stamp_ns, sensor=sensor, seq=seq, yaw_rad=yaw, sigma_rad=sigma)
-            case SaidAlong():
-                if said.through not in ("", config.through):
-                    return ignored(f"its velocity is through the {said.through}, and through is {config.through}")
-                return _along(said.v_mps, np.reshape(said.covariance, (3, 3)), stamp_ns, seq, sensor, config)
+        return measured(read(msg, config), stamp_ns, seq, sensor, config)
 
     return decoder
 
 
-DECODERS: dict[tuple[str, str], Decoder] = {
+_READERS: dict[tuple[str, str], Reader] = {
     ("imu", IMU): _imu,
-    ("gnss", NAV_SAT_FIX): _gnss,
-    **{("gnss", msgtype): _gnss for msgtype in GPS_FIXES},
-    **{("gnss", msgtype): _gnss_nmea for msgtype in NMEA},
-    **{("gnss", msgtype): _gnss_grid for msgtype in (ODOMETRY, POSE, PLAIN_POSE)},
-    ("compass", QUATERNION): _compass_quaternion,
-    ("compass", IMU): _compass_imu,
-    **{("compass", msgtype): _compass_nmea for msgtype in NMEA},
-    **{("compass", msgtype): _compass_number for msgtype in NUMBERS},
-    ("gnss_velocity", TWIST): _velocity,
-    ("gnss_velocity", PLAIN_TWIST): _velocity,
-    ("gnss_velocity", VECTOR): _velocity_vector,
+    **{("gnss", msgtype): _place for msgtype in FIX_TYPES},
+    **{("gnss", msgtype): _place_nmea for msgtype in NMEA},
+    **{("gnss", msgtype): _place_grid for msgtype in (ODOMETRY, POSE, PLAIN_POSE)},
+    ("compass", QUATERNION): _heading_quaternion,
+    ("compass", IMU): _heading_imu,
+    **{("compass", msgtype): _heading_nmea for msgtype in NMEA},
+    **{("compass", msgtype): _heading_number for msgtype in NUMBERS},
+    **{("gnss_velocity", msgtype): _velocity for msgtype in (TWIST, PLAIN_TWIST, VECTOR)},
     **{("gnss_velocity", msgtype): _velocity_gps_fix for msgtype in GPS_FIXES},
     **{("gnss_velocity", msgtype): _velocity_nmea for msgtype in NMEA},
-    ("body_velocity", ODOMETRY): _body_velocity,
-    ("body_velocity", TWIST): _body_velocity,
-    ("body_velocity", PLAIN_TWIST): _body_velocity,
-    ("body_velocity", VECTOR): _body_velocity_vector,
-    **{("body_velocity", msgtype): _body_velocity_nmea for msgtype in NMEA},
-    **{("body_velocity", msgtype): _body_velocity_number for msgtype in NUMBERS},
+    **{("body_velocity", msgtype): _along for msgtype in (ODOMETRY, TWIST, PLAIN_TWIST, VECTOR)},
+    **{("body_velocity", msgtype): _along_nmea for msgtype in NMEA},
+    **{("body_velocity", msgtype): _along_number for msgtype in NUMBERS},
     **{("pose", msgtype): _pose for msgtype in POSE_TYPES},
     **{(part.kind, msgtype): _by_maker(part) for msgtype, parts in VENDORS.items() for part in parts},
 }
+DECODERS: dict[tuple[str, str], Decoder] = {of: _decoder(read) for of, read in _READERS.items()}
 
 
 DECODERS_GROUP = (

@@ -21,16 +21,8 @@ from graphloc.frontends._assess import (
     track,
     vec,
 )
-from graphloc.frontends._assess_imu import (
-    ImuEvidence,
-    Inertial,
-    feels_motion,
-    imu_report,
-    inertial_of,
-    turned_as_headed,
-    turned_as_its_heading,
-    yaws_of,
-)
+from graphloc.frontends._assess_imu import Inertial, feels_motion, imu_report, inertial_of, turned_as_headed, yaws_of
+from graphloc.frontends._assess_mount import ImuEvidence, turned_as_its_heading
 from graphloc.frontends._assess_receivers import TWO_CRAFT_M, apart_warning
 from graphloc.frontends._assess_velocity import motion_of_poses, motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of

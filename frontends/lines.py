@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lines of JSON to measurements (docs/online-stream.md).
 
-A line becomes the message that a bag would hold and passes the decoders of bags, so that a stream and a bag of one run
-give equal measurements.
+What a line says passes the same checks as what the message in a bag says (`decode.measured`), so that a stream and a bag of
+one run give equal measurements.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
@@ -26,15 +25,15 @@ from graphloc.config import (
     GnssConfig,
     ImuConfig,
     PoseConfig,
-    SensorConfig,
     VelocityConfig,
     VesselConfig,
 )
 from graphloc.frames import Array, wrap_angle, yaw_from_heading_deg
 from graphloc.frontends._rejections import Rejection, malformed
-from graphloc.frontends.decode import DECODERS, NAV_SAT_FIX, POSE, TWIST, is_rtk
+from graphloc.frontends._said import SaidAlong, SaidHeading, SaidPlace, SaidPose, SaidVelocity
+from graphloc.frontends.decode import Decoded, ImuReading, is_rtk, measured, rotation_of, up_if_told
 from graphloc.ledger import LedgerRow, Outcome
-from graphloc.measurements import CompassHeading, ImuSample, Measurement, PoseFix, PoseMode
+from graphloc.measurements import ImuSample, Measurement, PoseFix, PoseMode
 from graphloc.time import NS_PER_S, duration_ns
 
 MAX_LINE = 1 << 20
@@ -43,7 +42,6 @@ TOPIC = "(stream)"
 """Topic, in the ledger, of lines that gave no measurement."""
 _MAX_REASON = 200
 _STATUS = {"none": -1, "fix": 0, "sbas": 1, "gbas": 2}  # sensor_msgs/NavSatStatus
-_UNKNOWN, _KNOWN = 0, 3  # NavSatFix.position_covariance_type
 _STAMP_LIMIT_NS = 9 * 10**18  # leaves room for a time offset in 64 bits
 _ZERO = (0.0, 0.0, 0.0)
 
@@ -165,14 +163,11 @@ class GnssLine(_Line):
     def _cov(self) -> Array:
         return _covariance(self.cov_enu_m2, self.sigma_m or _ZERO)
 
-    def measured(self, at: _At, config: GnssConfig) -> Measurement | Rejection:
+    def measured(self, at: _At, config: GnssConfig) -> Decoded:
         """Return the fix, or its rejection."""
-        fix = SimpleNamespace(
-            status=SimpleNamespace(status=_STATUS[self.status]), latitude=self.lat_deg, longitude=self.lon_deg,
-            altitude=math.nan if self.height_m is None else self.height_m, position_covariance=self._cov(),
-            position_covariance_type=_KNOWN if self.cov_enu_m2 or self.sigma_m else _UNKNOWN,
-        )  # fmt: skip
-        return _decoded(NAV_SAT_FIX, fix, at, config)
+        height_m = math.nan if self.height_m is None else self.height_m
+        said = SaidPlace(self.lat_deg, self.lon_deg, height_m, _STATUS[self.status], covariance=self._cov())
+        return measured(said, *at, config)
 
 
 class HeadingLine(_Line):
@@ -185,12 +180,10 @@ class HeadingLine(_Line):
     yaw_rad: Annotated[float, Field(ge=-6.2832, le=6.2832)] | None = None
     sigma_deg: Positive | None = None
 
-    def measured(self, at: _At, config: CompassConfig) -> Measurement | Rejection:
+    def measured(self, at: _At, config: CompassConfig) -> Decoded:
         """Return the heading, with the configured sigma if the line has none or its sigma is not to be used."""
         yaw = wrap_angle(self.yaw_rad) if self.yaw_rad is not None else yaw_from_heading_deg(self.heading_deg or 0.0)
-        sigma_deg = (self.sigma_deg if config.use_reported_sigma else None) or config.sigma_deg
-        sigma = float(np.radians(sigma_deg))
-        return CompassHeading(stamp_ns=at.stamp_ns, sensor=at.sensor, seq=at.seq, yaw_rad=float(yaw), sigma_rad=sigma)
+        return measured(SaidHeading(float(yaw), float(np.radians(self.sigma_deg or 0.0))), *at, config)
 
 
 class VelocityLine(_Line):
@@ -203,11 +196,10 @@ class VelocityLine(_Line):
     sigma_mps: Deviations | None = None
     cov_enu_m2ps2: Matrix3 | None = None
 
-    def measured(self, at: _At, config: VelocityConfig) -> Measurement | Rejection:
+    def measured(self, at: _At, config: VelocityConfig) -> Decoded:
         """Return the velocity."""
         cov = _covariance(self.cov_enu_m2ps2, self.sigma_mps or _ZERO)
-        as_named = config.model_copy(update={"convention": "enu"})  # the configured one is that of a bag
-        return _decoded(TWIST, _twist(self.v_enu_mps, cov), at, as_named)
+        return measured(SaidVelocity(up_if_told(self.v_enu_mps), covariance=cov), *at, config)
 
 
 class BodyVelocityLine(_Line):
@@ -220,9 +212,10 @@ class BodyVelocityLine(_Line):
     sigma_mps: Deviations | None = None
     cov_m2ps2: Matrix3 | None = None
 
-    def measured(self, at: _At, config: BodyVelocityConfig) -> Measurement | Rejection:
+    def measured(self, at: _At, config: BodyVelocityConfig) -> Decoded:
         """Return the velocity."""
-        return _decoded(TWIST, _twist(self.v_mps, _covariance(self.cov_m2ps2, self.sigma_mps or _ZERO)), at, config)
+        cov = _covariance(self.cov_m2ps2, self.sigma_mps or _ZERO)
+        return measured(SaidAlong(self.v_mps, cov), *at, config)
 
 
 class ModeSaid(_Said):
@@ -237,14 +230,13 @@ class ModeSaid(_Said):
     cov_m_rad: Matrix6 | None = None
     probability: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
 
-    def message(self) -> SimpleNamespace:
-        """Return the mode as a `geometry_msgs/PoseWithCovarianceStamped`."""
+    def said(self) -> SaidPose:
+        """Return what the mode says."""
         turn: Sequence[float] = self.quaternion_xyzw or (0.0, 0.0, 0.0, 0.0)  # as drivers without orientation write it
         if self.rpy_deg:
             turn = Rotation.from_euler("xyz", self.rpy_deg, degrees=True).as_quat().tolist()
         cov = _covariance(self.cov_m_rad, (*(self.sigma_m or _ZERO), *np.radians(self.sigma_deg or _ZERO)))
-        pose = SimpleNamespace(position=_xyz(self.xyz_m), orientation=_xyz(turn))
-        return SimpleNamespace(pose=SimpleNamespace(pose=pose, covariance=cov))
+        return SaidPose(np.array(self.xyz_m), rotation_of(turn), cov)
 
 
 class PoseLine(_Line):
@@ -254,14 +246,14 @@ class PoseLine(_Line):
     type: Literal["pose"]
     modes: Annotated[tuple[ModeSaid, ...], Field(min_length=1, max_length=64)]
 
-    def measured(self, at: _At, config: PoseConfig) -> Measurement | Rejection:
-        """Return the pose with its modes, each of which passes the decoder of poses; a rejection if one does not."""
+    def measured(self, at: _At, config: PoseConfig) -> Decoded:
+        """Return the pose with its modes, each of which passes the checks of poses; a rejection if one does not."""
         modes: list[PoseMode] = []
-        for said in self.modes:
-            fix = _decoded(POSE, said.message(), at, config)
+        for mode in self.modes:
+            fix = measured(mode.said(), *at, config)
             if not isinstance(fix, PoseFix):
                 return fix
-            modes.append(replace(fix.modes[0], probability=said.probability))
+            modes.append(replace(fix.modes[0], probability=mode.probability))
         return PoseFix(stamp_ns=at.stamp_ns, sensor=at.sensor, seq=at.seq, axes=config.axes, modes=tuple(modes))
 
 
@@ -345,6 +337,7 @@ def parse(line: bytes, number: int, seq: int, config: VesselConfig) -> Measureme
             value = message.measured(_At(stamp_ns, seq, sensor), config.sensors[sensor])
     except (ValueError, ArithmeticError) as error:
         value = malformed(f"{said}: {error}")
+    assert not isinstance(value, ImuReading)  # a line of an IMU is an `ImuSample`
     return trouble(value) if isinstance(value, Rejection) else value
 
 
@@ -358,24 +351,6 @@ def _first_of(error: ValidationError, model: type[Block]) -> str:
         return f"'{key}' is missing"
     text = first["msg"].removeprefix("Value error, ")
     return f"{key}: {text} (got {str(first['input'])[:40]!r})" if key else text
-
-
-def _decoded(msgtype: str, msg: SimpleNamespace, at: _At, config: SensorConfig) -> Measurement | Rejection:
-    value = DECODERS[(config.kind, msgtype)](msg, at.stamp_ns, at.seq, at.sensor, config)
-    assert isinstance(value, Measurement | Rejection)
-    return value
-
-
-def _xyz(values: Sequence[float]) -> SimpleNamespace:
-    """Return a vector (3,) or a quaternion (4,) as ROS messages hold them."""
-    return SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
-
-
-def _twist(v_mps: Sequence[float], cov: Array) -> SimpleNamespace:
-    """Return a `geometry_msgs/TwistWithCovarianceStamped` of a velocity with covariance (3, 3)."""
-    full = np.zeros((6, 6))
-    full[:3, :3] = cov
-    return SimpleNamespace(twist=SimpleNamespace(twist=SimpleNamespace(linear=_xyz(v_mps)), covariance=full))
 
 
 def _covariance(full: Sequence[Sequence[float]] | None, sigmas: Sequence[float]) -> Array:

@@ -15,10 +15,7 @@ from typing import Any
 
 from graphloc.frontends._novatel import NOVATEL, NOVATEL_STAMPS
 from graphloc.frontends._rejections import Rejection, malformed, rejected
-from graphloc.frontends._sbg import SBG
-from graphloc.frontends._septentrio import SEPTENTRIO
-from graphloc.frontends._ublox import UBLOX, UBLOX_STAMPS
-from graphloc.frontends._vendor_said import (
+from graphloc.frontends._said import (
     Part,
     SaidAlong,
     SaidHeading,
@@ -32,6 +29,9 @@ from graphloc.frontends._vendor_said import (
     xyz_of,
     yaw_of,
 )
+from graphloc.frontends._sbg import SBG
+from graphloc.frontends._septentrio import SEPTENTRIO
+from graphloc.frontends._ublox import UBLOX, UBLOX_STAMPS
 
 # KAIST's complex urban data set: its player makes these messages from GGA and GST. Older ones have a dilution, no
 # sigmas.

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -190,24 +189,14 @@ def _tracks(job: _Job) -> Tracks:
     recording, late_ns = struck.recording, struck.late_ns
     tracks: Tracks = {}
     if job.case is None or recording is not job.part:  # the smoother does not see that something came late
-        tracks["graphloc"] = _or_why_not(partial(_smoothed, recording, job))
-    tracks["graphloc online"] = _or_why_not(partial(_replayed, recording, job, late_ns))
+        tracks["graphloc"] = _or_why_not(lambda: app.solve(recording, job.config, job.datum).trajectory)
+    tracks["graphloc online"] = _or_why_not(
+        lambda: replay(recording, job.config, datum=job.datum, late_ns=late_ns).solution.trajectory
+    )
     known = as_it_comes(recording, late_ns)
-    for name, filtered in (("honest EKF", ekf.run_honest), ("BL EKF", ekf.run_bl)):
-        tracks[name] = _or_why_not(partial(_filtered, filtered, known, job))
+    tracks["honest EKF"] = _or_why_not(lambda: ekf.run_honest(known, job.config, job.datum).trajectory)
+    tracks["BL EKF"] = _or_why_not(lambda: ekf.run_bl(known, job.config, job.datum).trajectory)
     return tracks
-
-
-def _smoothed(recording: Recording, job: _Job) -> Trajectory:
-    return app.solve(recording, job.config, job.datum).trajectory
-
-
-def _replayed(recording: Recording, job: _Job, late_ns: Mapping[int, int]) -> Trajectory:
-    return replay(recording, job.config, datum=job.datum, late_ns=late_ns).solution.trajectory
-
-
-def _filtered(run: Callable[..., ekf.FilterResult], known: Recording, job: _Job) -> Trajectory:
-    return run(known, job.config, job.datum).trajectory
 
 
 def _or_why_not(solve: Callable[[], Trajectory]) -> tuple[Trajectory | None, str]:

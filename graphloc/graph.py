@@ -183,14 +183,14 @@ class Residual:
     raw: Array
     cov: Array
     jacobian: Callable[[], Array]
-    prior: float
-    size_m: float | None
-    size_deg: float | None
     slow_jacobian: Callable[[], Array] | None = None
     velocity_jacobian: Callable[[], Array] | None = None
     constant_jacobians: Callable[[], tuple[Array, ...]] = tuple
     white: Array | None = None
     expected_nis: float | None = None
+    prior: float = 1.0
+    size_m: float | None = None
+    size_deg: float | None = None
 
     @property
     def white_cov(self) -> Array:

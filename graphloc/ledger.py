@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from graphloc.errors import GraphlocError
 
+NOT_ASKED_FOR = "its sensor is switched off or not in the configuration"
 RECORDED_AT = ", recorded at "  # in a reason, before the time at which its message was recorded
 
 

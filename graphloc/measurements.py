@@ -20,24 +20,26 @@ NO_HEIGHT_M2 = 1e12
 """Variance, m^2, of the height of a fix that has none: 1000 km, 1 sigma."""
 
 
-def _frozen(value: object, shape: tuple[int, ...], name: str) -> Array:
-    array = np.array(value, dtype=float)
-    if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} is not finite")
-    array.flags.writeable = False
-    return array
+def _freeze(of: object, **shapes: tuple[int, ...]) -> None:
+    """Replace arrays of a frozen dataclass, by their names, by read-only copies."""
+    for name, shape in shapes.items():
+        array = np.array(getattr(of, name), dtype=float)
+        if array.shape != shape:
+            raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} is not finite")
+        array.flags.writeable = False
+        object.__setattr__(of, name, array)
 
 
-def _frozen_covariance(value: object, size: int, name: str) -> Array:
-    cov = _frozen(value, (size, size), name)
+def _freeze_covariance(of: object, size: int, name: str = "cov") -> None:
+    _freeze(of, **{name: (size, size)})
+    cov: Array = getattr(of, name)
     if np.count_nonzero(cov) == size and all(variance > 0.0 for variance in cov.diagonal().tolist()):
-        return cov  # diagonal, as mostly
+        return  # diagonal, as mostly
     # `np.allclose` written out: that takes longer than all else that is done here.
     if (np.abs(cov - cov.T) > 1e-12 + 1e-6 * np.abs(cov.T)).any() or np.linalg.eigvalsh(cov).min() <= 0.0:
         raise ValueError(f"{name} is not symmetric positive definite")
-    return cov
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,7 +74,7 @@ class GnssPosition(Measurement):
         if not (-90.0 <= lat <= 90.0 and -180.0 <= lon <= 360.0 and np.isfinite(height)):
             raise ValueError(f"position {lat}, {lon}, {height} is not on Earth")
         object.__setattr__(self, "position", Geodetic(lat, lon, height))
-        object.__setattr__(self, "cov_enu_m2", _frozen_covariance(self.cov_enu_m2, 3, "cov_enu_m2"))
+        _freeze_covariance(self, 3, "cov_enu_m2")
 
 
 def world_from_fixes(fixes: Sequence[GnssPosition], datum: Datum) -> Array:
@@ -102,8 +104,8 @@ class GnssVelocity(Measurement):
     cov_m2ps2: Array
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "v_enu_mps", _frozen(self.v_enu_mps, (3,), "v_enu_mps"))
-        object.__setattr__(self, "cov_m2ps2", _frozen_covariance(self.cov_m2ps2, 3, "cov_m2ps2"))
+        _freeze(self, v_enu_mps=(3,))
+        _freeze_covariance(self, 3, "cov_m2ps2")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,8 +123,8 @@ class BodyVelocity(Measurement):
     def __post_init__(self) -> None:
         if not self.axes or [a for a in "xyz" if a in self.axes] != list(self.axes):
             raise ValueError("axes must be some of x, y, z, in this order")
-        object.__setattr__(self, "value", _frozen(self.value, (len(self.axes),), "value"))
-        object.__setattr__(self, "cov", _frozen_covariance(self.cov, len(self.axes), "cov"))
+        _freeze(self, value=(len(self.axes),))
+        _freeze_covariance(self, len(self.axes))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -141,8 +143,8 @@ class PoseMode:
 
     def __post_init__(self) -> None:
         k = len(np.atleast_1d(self.value))
-        object.__setattr__(self, "value", _frozen(self.value, (k,), "value"))
-        object.__setattr__(self, "cov", _frozen_covariance(self.cov, k, "cov"))
+        _freeze(self, value=(k,))
+        _freeze_covariance(self, k)
         if not 0.0 < self.probability <= 1.0:
             raise ValueError("probability must be in (0, 1]")
 
@@ -195,9 +197,8 @@ class TagMode:
     probability: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "p_world_camera_m", _frozen(self.p_world_camera_m, (3,), "p_world_camera_m"))
-        object.__setattr__(self, "R_world_camera", _frozen(self.R_world_camera, (3, 3), "R_world_camera"))
-        object.__setattr__(self, "cov", _frozen_covariance(self.cov, 6, "cov"))
+        _freeze(self, p_world_camera_m=(3,), R_world_camera=(3, 3))
+        _freeze_covariance(self, 6)
         if not 0.0 < self.probability <= 1.0:
             raise ValueError("probability must be in (0, 1]")
 
@@ -235,12 +236,8 @@ class TagSighting(Measurement):
 
     def __post_init__(self) -> None:
         n = 4 * len(self.numbers)
-        shapes = {
-            "points_m": (n, 3), "pivot_m": (3,), "rays": (n, 2), "t_body_camera_m": (3,), "R_body_camera": (3, 3)
-        }  # fmt: skip
-        for name, shape in shapes.items():
-            object.__setattr__(self, name, _frozen(getattr(self, name), shape, name))
-        object.__setattr__(self, "cov", _frozen_covariance(self.cov, 2 * n, "cov"))
+        _freeze(self, points_m=(n, 3), pivot_m=(3,), rays=(n, 2), t_body_camera_m=(3,), R_body_camera=(3, 3))
+        _freeze_covariance(self, 2 * n)
         if not n or not self.modes:
             raise ValueError("a sighting needs a tag and a mode")
 
@@ -285,8 +282,7 @@ class ImuSample(Measurement):
     gyro_radps: Array
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "accel_mps2", _frozen(self.accel_mps2, (3,), "accel_mps2"))
-        object.__setattr__(self, "gyro_radps", _frozen(self.gyro_radps, (3,), "gyro_radps"))
+        _freeze(self, accel_mps2=(3,), gyro_radps=(3,))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -315,8 +311,7 @@ class ImuSeries:
             object.__setattr__(self, name, column)
         if n > 1 and (np.diff(self.stamps_ns) <= 0).any():
             raise ValueError("IMU stamps must increase strictly")
-        object.__setattr__(self, "accel_mps2", _frozen(self.accel_mps2, (n, 3), "accel_mps2"))
-        object.__setattr__(self, "gyro_radps", _frozen(self.gyro_radps, (n, 3), "gyro_radps"))
+        _freeze(self, accel_mps2=(n, 3), gyro_radps=(n, 3))
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -88,9 +88,6 @@ class MotionModel:
                 raw=J_a @ a.v_mps + J_b @ b.v_mps,
                 cov=variance[axis].reshape(1, 1),
                 jacobian=lambda: np.zeros((1, 6)),  # how the axes turned is left to the IMU
-                prior=1.0,
-                size_m=None,
-                size_deg=None,
             )
             terms = [Term(a.key, a.v_mps, J_a), Term(b.key, b.v_mps, J_b)]
             factors += linear_update(residual, terms, Decision(kernel=_KERNEL)).factors

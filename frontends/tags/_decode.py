@@ -44,8 +44,8 @@ class Codebook:
     codes: NDArray[np.uint64]
 
 
-def codebook(family: str, numbers: Collection[int] | None = None) -> Codebook:
-    """Return all tags of a family, or the ones with some numbers.
+def codebook(family: str, numbers: Collection[int] | None) -> Codebook:
+    """Return the tags of a family with some numbers; None: all.
 
     Raises:
         ConfigError: the family is unknown, or has no such number.

@@ -49,7 +49,7 @@ class TagFit(NamedTuple):
 
 
 def fit_tag(
-    grey: NDArray[np.uint8], about_px: Array, cells: NDArray[np.uint8], straight: Unbowed | None = None
+    grey: NDArray[np.uint8], about_px: Array, cells: NDArray[np.uint8], straight: Unbowed | None
 ) -> TagFit | None:
     """Return the fit of a tag to an image; None if it does not converge near the given corners.
 

@@ -23,26 +23,16 @@ Carry = tuple[int, Any]
 """Number of a state, and the motion preintegrated from it to a measurement."""
 
 
-class Stamps(Protocol):
-    """Stamps of states, by number."""
-
-    def __getitem__(self, k: int, /) -> Any:
-        """Return the stamp (ns) of a state."""
-        ...
-
-
 class OnTimeline(Protocol):
     """What `attach` needs to know of a timeline (`Timeline`, or a live one)."""
 
     @property
     def slow_of(self) -> Any:
         """Slow node of each state."""
-        ...
 
     @property
     def slow_stamps_ns(self) -> Any:
         """Stamp of each slow node."""
-        ...
 
 
 class Sited(Protocol):
@@ -51,27 +41,22 @@ class Sited(Protocol):
     @property
     def timeline(self) -> OnTimeline:
         """Stamps of the states."""
-        ...
 
     @property
     def R_body_imu(self) -> Array:
         """Rotation (3, 3) from the IMU's axes to the body's."""
-        ...
 
     @property
     def datum(self) -> Datum:
         """Origin of world."""
-        ...
 
     @property
     def links(self) -> InertialLink:
         """Preintegration of the IMU."""
-        ...
 
     @property
     def config(self) -> VesselConfig:
         """The vessel."""
-        ...
 
 
 class Estimates(Protocol):
@@ -79,19 +64,15 @@ class Estimates(Protocol):
 
     def exists(self, j: int, /) -> bool:
         """Return whether a key has a value."""
-        ...
 
     def atPose3(self, j: int, /) -> Any:
         """Return a pose."""
-        ...
 
     def atVector(self, j: int, /) -> Any:
         """Return a vector."""
-        ...
 
     def atConstantBias(self, j: int, /) -> Any:
         """Return a bias of the IMU."""
-        ...
 
 
 class Attaching(Protocol):
@@ -100,62 +81,50 @@ class Attaching(Protocol):
     @property
     def number(self) -> int:
         """Number of the sensor, for keys."""
-        ...
 
     @property
     def mount(self) -> Any:
         """Pose of the sensor seen from the IMU, body axes (gtsam.Pose3)."""
-        ...
 
     @property
     def slow(self) -> SlowProcess | None:
         """Slow state of the sensor."""
-        ...
 
     @property
     def without_height(self) -> bool:
         """Whether the heights of the sensor's fixes are not used."""
-        ...
 
     @property
     def constants(self) -> tuple[Constant, ...]:
         """Constants that the sensor's measurements may share."""
-        ...
 
     @property
     def shares(self) -> int | None:
         """Number of the sensor whose constants these are; None: they are the sensor's own."""
-        ...
 
     @property
     def measurements(self) -> Any:
         """Measurements, by index."""
-        ...
 
     @property
     def state(self) -> Any:
         """State of each measurement."""
-        ...
 
     @property
     def carry(self) -> Any:
         """Motion from the state before each measurement to it (`Carry`), or None."""
-        ...
 
     @property
     def gyro_radps(self) -> Any:
         """Raw angular rate at each measurement, rad/s, body axes."""
-        ...
 
     @property
     def felt(self) -> Any:
         """Raw specific force and change of the rate about each measurement (6,), m/s^2 and rad/s^2, body axes."""
-        ...
 
     @property
     def apart_s(self) -> Any:
         """Usual time between measurements at each of them, s (`spacing_s`)."""
-        ...
 
 
 class Judged(Attaching, Protocol):
@@ -164,17 +133,14 @@ class Judged(Attaching, Protocol):
     @property
     def name(self) -> str:
         """Name of the sensor."""
-        ...
 
     @property
     def row(self) -> Sensor:
         """Row of the sensor in the table."""
-        ...
 
     @property
     def config(self) -> Any:
         """Configuration of the sensor."""
-        ...
 
 
 def nav_state(values: Estimates, k: int) -> Any:
@@ -182,14 +148,14 @@ def nav_state(values: Estimates, k: int) -> Any:
     return gtsam.NavState(values.atPose3(keys.pose(k)), values.atVector(keys.velocity(k)))
 
 
-def state_of(m: Measurement, floor: int, nearest: int, stamps_ns: Stamps, holes: Sequence[tuple[int, int]]) -> int:
+def state_of(m: Measurement, floor: int, nearest: int, stamps_ns: Any, holes: Sequence[tuple[int, int]]) -> int:
     """Return the state that a measurement attaches to: the nearest, or the one before where an IMU gap is in between.
 
     The measurement is propagated from the state before it. Across a gap the motion to the nearest state is uncertain;
     written as a factor of that state, the measurement would count as new information each time it is linearised.
 
     Args:
-        floor, nearest: the state before the measurement, and the nearest one.
+        floor, nearest: the state before the measurement, and the nearest one. stamps_ns: of the states, by number.
         holes: gaps of the IMU (start, stop), ns.
     """
     start_ns, stop_ns = int(stamps_ns[floor]), int(stamps_ns[nearest])

@@ -8,7 +8,7 @@ from collections.abc import Container
 
 from graphloc.config import VesselConfig
 from graphloc.errors import SolveError
-from graphloc.ledger import LedgerRow, Outcome
+from graphloc.ledger import NOT_ASKED_FOR, LedgerRow, Outcome
 from graphloc.measurements import ImuSeries, Measurement
 from graphloc.recording import Recording
 from graphloc.time import utc_text
@@ -77,7 +77,7 @@ def sorted_out(
         every[m.sensor] += 1
         outcome, reason = Outcome.REJECTED, "no IMU data at this stamp"
         if m.sensor not in asked_for:
-            outcome, reason = Outcome.IGNORED, "its sensor is switched off or not in the configuration"
+            outcome, reason = Outcome.IGNORED, NOT_ASKED_FOR
         elif start <= m.stamp_ns <= stop:
             inside.append(m)
             continue

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from copy import copy
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import expit
@@ -145,15 +146,13 @@ class Agreement:
             newest[receiver] = max(newest.get(receiver, (_Standing(), "")), (standing, name))
         return list(newest.values())
 
-    def marked(self) -> _Mark:
+    def marked(self) -> dict[str, Any]:
         """Return all that is noted, for `back_to`."""
-        levels = self._usual_ns, self._jumped_ns, self._told_ns, self._matched_ns
-        return dict(self.agreed_ns), dict(self._standing), list(self._refused), dict(self._denied), *levels
+        return {name: copy(noted) for name, noted in vars(self).items() if name != "_timeline"}
 
-    def back_to(self, mark: _Mark) -> None:
+    def back_to(self, mark: Mapping[str, Any]) -> None:
         """Forget what was noted since `marked`: it was judged under choices of modes that were given up."""
-        self.agreed_ns, self._standing, self._refused, self._denied = mark[:4]
-        self._usual_ns, self._jumped_ns, self._told_ns, self._matched_ns = mark[4:]
+        vars(self).update(mark)
 
     def inherit(self, before: Agreement) -> None:
         """Take over when each sensor last agreed, and since when the usual level or a jump has been held.
@@ -197,11 +196,6 @@ class Agreement:
         begin, end = (seconds(ns) for ns in self._usual_ns or (self._jumped_ns, self._jumped_ns))
         jumped_s = seconds(now_ns) - seconds(self._jumped_ns)
         return jumped_s if jumped_s > float(np.clip(end - begin, *_JUMPED_S)) else 0.0
-
-
-_Mark = tuple[
-    dict[str, int], dict[str, _Standing], list[int], dict[str, int], tuple[int, int] | None, int | None, int, int
-]
 
 
 def _credible(stream: LiveStream, at: Attachment) -> bool:

@@ -109,21 +109,18 @@ class Constants:
                 continue
             if not window.values.exists(key):
                 known = self._known.pop(key, None)
-                if known is None and constant.corrects:
-                    value = np.zeros(len(constant.sigma))
-                    window.guess(key, value, now_s)
-                    window.add([_about_zero(key, never_revised(constant.sigma))])
-                    self._hold(constant, key, value)
-                    window.touch(key, now_s)
-                    continue
-                if known is None:
-                    value = np.zeros(len(constant.sigma))
-                    tails = gtsam.noiseModel.mEstimator.Cauchy.Create(float(np.sqrt(CONSTANT_TAILS)))
-                    model: Any = gtsam.noiseModel.Robust.Create(tails, gtsam.noiseModel.Diagonal.Sigmas(constant.sigma))
-                else:
-                    value, model = known.value, gtsam.noiseModel.Gaussian.Covariance(known.cov)
+                value = np.zeros(len(constant.sigma)) if known is None else known.value
                 window.guess(key, value, now_s)
+                if known is not None:
+                    model: Any = gtsam.noiseModel.Gaussian.Covariance(known.cov)
+                elif constant.corrects:
+                    model = gtsam.noiseModel.Diagonal.Sigmas(never_revised(constant.sigma))
+                else:
+                    tails = gtsam.noiseModel.mEstimator.Cauchy.Create(float(np.sqrt(CONSTANT_TAILS)))
+                    model = gtsam.noiseModel.Robust.Create(tails, gtsam.noiseModel.Diagonal.Sigmas(constant.sigma))
                 window.add([gtsam.PriorFactorVector(key, value, model)])
+                if known is None and constant.corrects:
+                    self._hold(constant, key, value)
             window.touch(key, now_s)
 
     def marked(self) -> Callable[[], None]:

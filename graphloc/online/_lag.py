@@ -51,7 +51,7 @@ class Lag:
 
     Args:
         problem: what the factors are built from. anchor: estimate at the first state. lag_s: length of the window.
-        guess: pose, velocity (3,) and bias (6,) that the first state is first solved at; default: the anchor's.
+        guess: pose, velocity (3,) and bias (6,) that the first state is first solved at; None: the anchor's.
 
     Raises:
         SolveError: by every method; the window cannot be used afterwards.
@@ -61,7 +61,7 @@ class Lag:
     """
 
     def __init__(
-        self, problem: LiveProblem, anchor: Anchor, lag_s: float, guess: tuple[gtsam.Pose3, Array, Array] | None = None
+        self, problem: LiveProblem, anchor: Anchor, lag_s: float, guess: tuple[gtsam.Pose3, Array, Array] | None
     ) -> None:
         self.problem, self.lag_s, self._window = problem, lag_s, Window(lag_s)
         self._constants = Constants(problem, self._window, anchor.constants)

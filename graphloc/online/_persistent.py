@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -115,6 +116,23 @@ class PersistentState:
             R_odom_body=self.odometry.R,
             unmodelled=None if self.unmodelled is None else self.unmodelled.sizes,
         )
+
+    def learns_in_trial(self, since_ns: int) -> Callable[[], None]:
+        """Replace by copies what learns from each measurement; return a function that brings the originals back.
+
+        Args:
+            since_ns: stamp from which the IMU is left out: the accelerations of the heading check are wrong.
+        """
+        before = self.receivers, self.heading_check, self.motion_model
+        self.receivers, self.motion_model = deepcopy(self.receivers), deepcopy(self.motion_model)
+        self.heading_check = HeadingCheck()
+        for receiver in self.receivers.values():
+            receiver.jump.forget_since(since_ns)
+
+        def back() -> None:
+            self.receivers, self.heading_check, self.motion_model = before
+
+        return back
 
     def forget_receivers(self) -> None:
         """Forget position jumps and repetitions of receivers: they were found with the estimate, which is given up."""

@@ -40,7 +40,7 @@ from graphloc.time import NS_PER_S
 _SAME_M, _AWAY_M = 0.2, 1.0
 _SIGMAS = 3.0  # sigmas that the estimated speed must exceed
 _SHARE = 0.5  # share of the speed before, by the fixes or as estimated, below which the vessel brakes
-_KEPT = 200  # items, so that memory stays bounded: ten seconds of a receiver at 20 Hz; a choice
+KEPT = 200  # items, so that memory stays bounded: ten seconds of a receiver at 20 Hz; a choice
 
 
 class RepeatedFixDetector:
@@ -53,14 +53,14 @@ class RepeatedFixDetector:
     def __init__(self) -> None:
         self.frozen = False
         # The last different places: stamp (ns) of the first fix there, place, and the estimated velocity at that stamp.
-        self._places: deque[tuple[int, Array, Array]] = deque(maxlen=_KEPT)
-        self._rest: deque[tuple[int, Array]] = deque(maxlen=_KEPT)  # fixes of some seconds, none repeated
+        self._places: deque[tuple[int, Array, Array]] = deque(maxlen=KEPT)
+        self._rest: deque[tuple[int, Array]] = deque(maxlen=KEPT)  # fixes of some seconds, none repeated
         # How often such fixes were at rest: the receiver then scatters there, and does not repeat a position
         self._seen = 0
         self._last: tuple[int, Array] | None = None  # newest fix
         self._equal_ns, self._equal = 0, 0  # stamp of the first of the fixes that equal the newest, and their number
         self._since_ns: int | None = None  # stamp of the first old repetition of the present place; None: there is none
-        self._old: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)  # old repetitions: first and last stamp, place
+        self._old: deque[tuple[int, int, Array]] = deque(maxlen=KEPT)  # old repetitions: first and last stamp, place
 
     def note(self, stamp_ns: int, told_m: Array, v_mps: Array, sigma_mps: float) -> int | None:
         """Take in a fix; a late one is ignored.

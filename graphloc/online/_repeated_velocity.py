@@ -8,10 +8,10 @@ from collections import deque
 import numpy as np
 
 from graphloc.frames import Array
+from graphloc.online._repeated_fix import KEPT
 from graphloc.signals.frozen_receiver import MANY, MOSTLY, REST_MPS
 
 _RUNS = 20  # different velocities after which it is known whether they are rounded
-_KEPT = 200  # as in `_repeated_fix`
 
 
 class RepeatedVelocityDetector:
@@ -23,7 +23,7 @@ class RepeatedVelocityDetector:
         self._begin_ns, self._equal = 0, 0
         self._runs = self._singles = 0  # number of runs of equal velocities; number of runs of length 1
         # Old repetitions: first and last stamp (ns), velocity
-        self._old: deque[tuple[int, int, Array]] = deque(maxlen=_KEPT)
+        self._old: deque[tuple[int, int, Array]] = deque(maxlen=KEPT)
 
     def note(self, stamp_ns: int, v_mps: Array) -> None:
         """Take in a velocity (3,), m/s in world; a late one is ignored."""

@@ -22,7 +22,7 @@ from graphloc.frames import Array, Datum
 from graphloc.graph import Sensor
 from graphloc.inertial import InertialRow
 from graphloc.judge.warnings import slow_error_warning
-from graphloc.ledger import LedgerRow, Outcome
+from graphloc.ledger import NOT_ASKED_FOR, LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement
 from graphloc.online._intake import ImuIntake, series_of
 from graphloc.online._ledger import OnlineLedger
@@ -49,7 +49,6 @@ _AHEAD_S = 60.0  # by which a stamp may lie ahead of the IMU's: beyond, it is of
 _MOST_REPEATS = 1000  # messages of a sensor: what is repeated later comes too late to be used, too
 _MOST_NAMES = 100  # unconfigured sensors of which it is said, once each, that they are ignored
 _NOT_REACHED = "the estimate restarted before IMU data reached its stamp"
-_NOT_ASKED = "its sensor is switched off or not in the configuration"
 
 
 class OnlineSmoother:
@@ -188,7 +187,7 @@ class OnlineSmoother:
         if isinstance(m, ImuSample):
             return self._feed_imu(m)
         if m.sensor not in self._setup.measuring:
-            self._ignore(m, _NOT_ASKED)
+            self._ignore(m, NOT_ASKED_FOR)
             return None
         if self._repeats[m.sensor].repeats(m.stamp_ns, m):
             self._ledger.drop(m, Outcome.REJECTED, REPEATED)
@@ -258,7 +257,7 @@ class OnlineSmoother:
         if m.sensor != self._setup.imu_name:
             sensor = self._setup.config.sensors.get(m.sensor)
             other = sensor is not None and sensor.enabled and self._setup.imu_name
-            self._ignore(m, f"{other} is the IMU" if other else _NOT_ASKED)
+            self._ignore(m, f"{other} is the IMU" if other else NOT_ASKED_FOR)
             return None
         taken = self._intake.take(m, started=self._tracking is not None)
         for lost, why in taken.dropped:

@@ -21,7 +21,6 @@ from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample, ImuSeries, Measurement
 from graphloc.online._anchor import Anchor
 from graphloc.online._estimates import estimate_of
-from graphloc.online._heading_check import HeadingCheck
 from graphloc.online._heading_guess import HeadingGuess
 from graphloc.online._imu_doubt import ImuDoubt, turns_otherwise
 from graphloc.online._intake import series_of
@@ -117,7 +116,7 @@ class Tracking:
             for name, stream in problem.streams.items():
                 was = before.problem.streams[name]
                 if stream.config == was.config:  # else its residuals were normalised to other sigmas
-                    stream.scatter = was.scatter
+                    stream.scatter = deepcopy(was.scatter)
         lag = Lag(problem, anchor, setup.lag_s, guess)
         if before is not None:
             lag.inherit(before)
@@ -383,7 +382,7 @@ class Tracking:
 
     # Rebuild, end
 
-    def rebuild(self, why: str, until_ns: int, misled: float = 1.0) -> str:
+    def rebuild(self, why: str, until_ns: int, misled: float) -> str:
         """Build the window anew.
 
         It begins at its first anchor, with all its measurements; if that fails, at the last anchor, without later
@@ -483,28 +482,17 @@ class Tracking:
 
     def _begin_trial(self, since_ns: int, until_ns: int) -> Callable[[], None]:
         """Leave out the IMU samples between two stamps, for a rebuild of the window; return a function to undo it."""
-        ledger, recent, persistent = self._ledger, self._recent, self._persistent
-        mark, lag, pending, height_due_ns = ledger.marked(), self.lag, self._pending, self._height_due_ns
-        doubt = deepcopy(self._doubt)
-        # Objects that learn from each measurement are replaced by copies, so that a trial that fails leaves no trace in
-        # them.
-        receivers, check, model = persistent.receivers, persistent.heading_check, persistent.motion_model
-        scatters = {name: deepcopy(stream.scatter) for name, stream in lag.problem.streams.items()}
-        persistent.receivers, persistent.motion_model = deepcopy(receivers), deepcopy(model)
-        persistent.heading_check = HeadingCheck()  # its accelerations are wrong
-        for receiver in persistent.receivers.values():
-            receiver.jump.forget_since(since_ns)
+        mark, forget_learned = self._ledger.marked(), self._persistent.learns_in_trial(since_ns)
+        lag, pending, height_due_ns, doubt = self.lag, self._pending, self._height_due_ns, deepcopy(self._doubt)
         self._doubt.leave_out(since_ns, until_ns)
-        out = recent.leave_out(since_ns)
+        out = self._recent.leave_out(since_ns)
 
         def take_back() -> None:
-            ledger.back_to(mark)
+            self._ledger.back_to(mark)
+            forget_learned()
             self.lag, self._pending, self._height_due_ns, self._doubt = lag, pending, height_due_ns, doubt
-            persistent.receivers, persistent.heading_check, persistent.motion_model = receivers, check, model
-            for name, stream in lag.problem.streams.items():
-                stream.scatter = scatters[name]
             for m in out:
-                recent.keep(m)
+                self._recent.keep(m)
 
         return take_back
 

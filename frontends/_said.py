@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What makers' messages say, as plain values, and what several makers share: sigmas, headings, GPS time."""
+"""What messages say, as plain values, and what several makers' messages share: sigmas, headings, GPS time."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from datetime import UTC, datetime
 from math import atan2, isfinite, radians
 from typing import Any, NamedTuple, TypeVar
 
+from numpy.typing import ArrayLike
+
+from graphloc.frames import Array
 from graphloc.frontends._clock import NO_DATE_NS
 from graphloc.frontends._rejections import Rejection, rejected
 from graphloc.time import NS_PER_S
@@ -27,6 +30,7 @@ class SaidPlace(NamedTuple):
         latitude_deg, longitude_deg, height_m: position, height above the ellipsoid, NaN if not measured.
         status: as in `NavSatStatus`. horizontal_m, vertical_m: sigma of an axis; 0 if not told.
         filtered: whether a filter made it from several sensors.
+        covariance: (3, 3), m^2, east, north, up, zeros if not told; None: the sigmas tell it.
     """
 
     latitude_deg: float
@@ -36,15 +40,17 @@ class SaidPlace(NamedTuple):
     horizontal_m: float = 0.0
     vertical_m: float = 0.0
     filtered: bool = False
+    covariance: Array | None = None
 
 
 class SaidVelocity(NamedTuple):
-    """A velocity over ground, its horizontal and vertical sigma (0 if not told), and whether a filter made it."""
+    """A velocity over ground, horizontal where its up is NaN; and its uncertainty, as of `SaidPlace`."""
 
     v_mps: tuple[float, float, float]
     horizontal_mps: float = 0.0
     vertical_mps: float = 0.0
     filtered: bool = False
+    covariance: Array | None = None
 
 
 class SaidHeading(NamedTuple):
@@ -59,13 +65,21 @@ class SaidAlong(NamedTuple):
     """A velocity along the axes of the sensor.
 
     Attributes:
-        v_mps, covariance: velocity; its covariance, 9 values, row by row, 0 if not told.
+        v_mps, covariance: velocity along x, or x and y, or all; its covariance, row by row, zeros if not told.
         through: 'ground' or 'water'; '' if not told.
     """
 
-    v_mps: tuple[float, float, float]
-    covariance: tuple[float, ...]
+    v_mps: tuple[float, ...]
+    covariance: ArrayLike
     through: str = ""
+
+
+class SaidPose(NamedTuple):
+    """A position (3,), a rotation (3, 3), None if not told, and the covariance of both (6, 6), translation first."""
+
+    position_m: Array
+    rotation: Array | None
+    covariance: Array
 
 
 Said = SaidInertial | SaidPlace | SaidVelocity | SaidHeading | SaidAlong
