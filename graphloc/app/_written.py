@@ -15,7 +15,7 @@ from graphloc.app._run import Run, antennas
 from graphloc.config import load_config
 from graphloc.eval import metrics, report
 from graphloc.eval.docking import docking_table
-from graphloc.eval.ekf import named_tracks
+from graphloc.eval.ekf import named_tracks, starts_at_truth
 from graphloc.eval.holdout import suggested
 from graphloc.factors import KINDS
 from graphloc.folders import fresh_folder
@@ -59,12 +59,13 @@ def truth_statement(run: Run) -> str:
     """Say plainly what the numbers were measured against."""
     if run.recording.truth is not None:
         truth = run.recording.truth
-        span_s = (int(truth.stamps_ns[-1]) - int(truth.stamps_ns[0])) / 1e9
+        span_s, run_s = ((int(t.stamps_ns[-1]) - int(t.stamps_ns[0])) / 1e9 for t in (truth, run.solution.trajectory))
         named = run.config.truth or "given with the recording"
-        imu = run.recording.imu
-        begun = bool(run.filters) and imu is not None and bool(truth.covers(imu.stamps_ns[:1]).all())
+        begun = bool(run.filters) and starts_at_truth(run.recording)
         started = " The EKFs are started at it, as BL started theirs; graphloc is not." if begun else ""
-        return f"Truth: {named}, {len(truth)} poses over {span_s:.0f} s; it was not fused.{started}"
+        poses = "poses" if truth.headed else "positions without a heading"
+        of_run = "" if span_s > 0.95 * run_s else f" of the run's {run_s:.0f} s"
+        return f"Truth: {named}, {len(truth)} {poses} over {span_s:.0f} s{of_run}; it was not fused.{started}"
     if run.held:
         sensors = [row.sensor for row in run.recording.rows if row.outcome is Outcome.HELD_OUT]
         velocities = sum(name in run.config.of_kind("gnss_velocity") for name in sensors)
