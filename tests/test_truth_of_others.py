@@ -153,7 +153,7 @@ def test_an_error_with_one_cause_is_named_by_it() -> None:
     assert "truth_time_offset_s: 4.70)" in said
     said = one_cause(found_for(track, np.tile([2.0, 0.0], (len(track), 1))), 0.0)
     assert said.startswith(". All but 0.00 m (RMS) of its error stays the same, 2.00 m east ")
-    assert said.count("All but") == 1
+    assert "; or all but" not in said
     assert one_cause(found_for(track, np.random.default_rng(0).normal(size=(len(track), 2))), 0.0) == ""
 
 
@@ -161,7 +161,7 @@ def test_on_a_straight_course_every_cause_is_named() -> None:
     track = track_of(turning=False)
     assert track.v_world_mps is not None
     said = one_cause(found_for(track, 0.3 * track.v_world_mps[:, :2]), 0.0)
-    assert len(re.findall(r"All but 0\.00 m \(RMS\) of its error (?:stays|turns|goes)", said)) == 3
+    assert len(re.findall(r"[Aa]ll but 0\.00 m \(RMS\) of its error (?:stays|turns|goes)", said)) == 3
 
 
 def test_a_truth_elsewhere_on_the_vessel_is_said_in_the_verdict(run: app.Run) -> None:

@@ -40,11 +40,12 @@ def one_cause(found: TrackErrors, offset_s: float) -> str:
     least_m = min(left_m for left_m, _ in explained)
     if least_m >= _LEFT * rms(np.linalg.norm(off, axis=1)):
         return ""
-    return "".join(
-        f". All but {left_m:.2f} m (RMS) of its error {said}"
+    alike = (
+        f"ll but {left_m:.2f} m (RMS) of its error {said}"
         for left_m, said in explained
         if left_m <= _AS_WELL * least_m + _ALIKE_M
     )
+    return ". A" + "; or a".join(alike)
 
 
 def _origin(off_m: Array) -> str:
