@@ -66,6 +66,12 @@ def test_of_what_part_the_truth_is_is_said(run: app.Run) -> None:
     part = truth.where(truth.stamps_ns < truth.stamps_ns[0] + 8_000_000_000)
     assert " over 8 s of the run's 20 s;" in app.truth_statement(with_truth(run, part))
     assert " over 20 s;" in app.truth_statement(run)
+    assert app.tables(with_truth(run, part))[0].note.endswith("not aligned; the truth covers 8 s of the run's 20 s")
+    assert app.tables(run)[0].note.endswith("not aligned")
+    gap = truth.where(abs(truth.stamps_ns - truth.stamps_ns[0] - 10_000_000_000) > 4_000_000_000)
+    assert " over 12 s of the run's 20 s;" in app.truth_statement(with_truth(run, gap))
+    slow = truth.where(slice(None, None, 250))  # each 5 s
+    assert " over 15 s of" in app.truth_statement(with_truth(run, slow))
 
 
 def positions_of(truth: Trajectory) -> Trajectory:

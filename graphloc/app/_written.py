@@ -10,6 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
+
 from graphloc import found_tags, outputs
 from graphloc.app._run import Run, antennas
 from graphloc.config import load_config
@@ -24,13 +26,20 @@ from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
+_NEARLY_ALL = 0.95  # share of a run from which a truth is said to be of all of it; a choice
+
 
 def tables(run: Run) -> tuple[metrics.Table, ...]:
     """Return the numbers of a run: against truth, held-out fixes, and the speed check."""
     found: list[metrics.Table] = []
     estimates = named_tracks(run.solution, run.filters)
     if run.recording.truth is not None:
-        found.append(metrics.truth_table(estimates, run.recording.truth))
+        table, lasts = (
+            metrics.truth_table(estimates, run.recording.truth),
+            _lasts(run.recording.truth, run.solution.trajectory),
+        )
+        part = f"; the truth covers {lasts}" if "of the run" in lasts else ""
+        found.append(replace(table, note=table.note + part))
         found += _docking_tables(run, estimates, run.recording.truth)
     if run.held:
         slow = {s.name: s.slow for s in (run.solution, run.online) if s is not None}
@@ -59,13 +68,11 @@ def truth_statement(run: Run) -> str:
     """Say plainly what the numbers were measured against."""
     if run.recording.truth is not None:
         truth = run.recording.truth
-        span_s, run_s = ((int(t.stamps_ns[-1]) - int(t.stamps_ns[0])) / 1e9 for t in (truth, run.solution.trajectory))
         named = run.config.truth or "given with the recording"
         begun = bool(run.filters) and starts_at_truth(run.recording)
         started = " The EKFs are started at it, as BL started theirs; graphloc is not." if begun else ""
         poses = "poses" if truth.headed else "positions without a heading"
-        of_run = "" if span_s > 0.95 * run_s else f" of the run's {run_s:.0f} s"
-        return f"Truth: {named}, {len(truth)} {poses} over {span_s:.0f} s{of_run}; it was not fused.{started}"
+        return f"Truth: {named}, {len(truth)} {poses} over {_lasts(truth, run.solution.trajectory)}; it was not fused.{started}"
     if run.held:
         sensors = [row.sensor for row in run.recording.rows if row.outcome is Outcome.HELD_OUT]
         velocities = sum(name in run.config.of_kind("gnss_velocity") for name in sensors)
@@ -91,6 +98,14 @@ def truth_statement(run: Run) -> str:
     return (
         f"{said}. `graphloc compare --hold-out {by}` does." if by else f"{said}; a `truth_topic` or `truth_file` would."
     )
+
+
+def _lasts(truth: Trajectory, track: Trajectory) -> str:
+    """Say for how long a truth is known, gaps left out, and of how long a run if that is less than nearly all of it."""
+    steps_s = np.diff(truth.stamps_ns) / 1e9
+    known_s = float(steps_s[steps_s <= max(2.5 * float(np.median(steps_s)), 1.0)].sum())
+    run_s = float(track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9
+    return f"{known_s:.0f} s" + ("" if known_s > _NEARLY_ALL * run_s else f" of the run's {run_s:.0f} s")
 
 
 def _titled(vessel: str, source: str) -> str:
