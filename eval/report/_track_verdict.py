@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +49,10 @@ _STAYS = 0.5
 # the online track starts seconds later.
 _ALIKE = 0.1
 _WORSE = 1.05  # ratio of our error to a filter's from which the filter is reported as more accurate
+
+
+Row = Mapping[str, float | None]
+"""Of one estimate, its numbers by name."""
 
 
 class Trust(enum.IntEnum):
@@ -516,8 +520,7 @@ def _accuracy(data: ReportData, name: str) -> str:
             else f", over the {percent(covered)} that it covers"
         )
     others = {n: v for n, row in values.items() if n != name and (v := row[key]) is not None}
-    # No ratio to an error over a time that our track lacks, as the time before its start.
-    alike = {n for n in others if abs((values[n].get("matched") or 1.0) - covered) <= _ALIKE}
+    alike = {n for n in others if over_one_time(values[n], values[name])}
     if name != data.solution.name:  # the online track is not compared with the offline one, which knows later data
         others.pop(data.solution.name, None)
     beside = ", ".join(
@@ -525,6 +528,14 @@ def _accuracy(data: ReportData, name: str) -> str:
         for n, value in others.items()
     )
     return f"{said}; beside it: {beside}." if beside else f"{said}."
+
+
+def over_one_time(one: Row, other: Row) -> bool:
+    """Return whether two estimates cover about as much of the reference.
+
+    There is no ratio to an error over a time that our track lacks, as the time before its start.
+    """
+    return abs((one.get("matched") or 1.0) - (other.get("matched") or 1.0)) <= _ALIKE
 
 
 def times(value: float, mine: float) -> str:
