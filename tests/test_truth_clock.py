@@ -105,17 +105,18 @@ def test_too_little_time_in_common_tells_nothing() -> None:
     assert clock_apart(track, replace(far, stamps_ns=np.append(far.stamps_ns[:-1], far.stamps_ns[-1] + 10**16))) is None
 
 
-def test_a_run_says_so_of_its_truth() -> None:
-    """The truth of a run in GPS time, and the same put right."""
+@pytest.mark.parametrize("by_s", [18.0, 40.0])
+def test_a_run_says_so_of_its_truth(by_s: float) -> None:
+    """The truth of a run in GPS time, or on a clock that is off by most of the run, and the same put right."""
     quick = Scenario(
         path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0
     )
     run = simulate_slowly(quick, 78)
-    late = app.smooth_recording(replace(run.recording, truth=later(run.truth, 18.0)), run.config)
+    late = app.smooth_recording(replace(run.recording, truth=later(run.truth, by_s)), run.config)
     (said,) = (w for w in late.warnings if "truth_time_offset_s" in w)
     named = re.search(r"^/truth: .* set truth_time_offset_s: (-?[\d.]+)$", said)
     assert named
-    assert float(named[1]) == pytest.approx(-18.0, abs=0.1)
+    assert float(named[1]) == pytest.approx(-by_s, abs=0.1)
     (track,) = verdict(app.report_data(late)).tracks
     assert any("truth is on another clock" in reason.text for reason in track.reasons)
     assert not any(reason.trust is Trust.NO for reason in track.reasons)

@@ -46,7 +46,8 @@ def made_comparable(run: Run) -> Run:
     """Drop what shares no time with the track, and say so; say so, too, of a truth whose clock is another one."""
     truth, speed, held, track = run.recording.truth, run.recording.check_speed, run.held, run.solution.trajectory
     said: list[str] = []
-    if truth is not None and (apart := clock_apart(track, truth)) is not None:
+    apart = None if truth is None else clock_apart(track, truth)
+    if apart is not None:
         said.append(apart.said(run.config.truth or "truth", run.config.truth_time_offset_s))
 
     def comparable(compare: Callable[..., object], *arguments: object) -> bool:
@@ -57,7 +58,7 @@ def made_comparable(run: Run) -> Run:
             return False
         return True
 
-    if truth is not None:
+    if truth is not None and not (apart is not None and apart.of_clock):  # else the report shows it by all of the truth
         truth = _during(run.recording, truth)
     if truth is not None and not comparable(metrics.common_stamps, track, truth):
         truth = None
