@@ -121,6 +121,17 @@ def test_a_run_says_so_of_its_truth(by_s: float) -> None:
     assert any("truth is on another clock" in reason.text for reason in track.reasons)
     assert not any(reason.trust is Trust.NO for reason in track.reasons)
     assert clock_apart(late.solution.trajectory, run.truth) is None
+    # Of the online track, whose velocities are too noisy to show it, 'do not rely on it' was said: the truth were an antenna 43 m astern.
+    solution, data = late.solution, app.report_data(late)
+    v = solution.trajectory.v_world_mps
+    assert v is not None
+    noisy = replace(solution.trajectory, v_world_mps=v + np.random.default_rng(0).normal(size=v.shape))
+    assert clock_apart(noisy, later(run.truth, by_s)) is None
+    online = replace(solution, trajectory=noisy, stats=replace(solution.stats, online=True))
+    table = replace(data.tables[0], rows=(*data.tables[0].rows, ("graphloc online", data.tables[0].rows[0][1])))
+    beside = verdict(replace(data, online=online, tables=(table,))).tracks[1]
+    assert any("truth is on another clock" in reason.text for reason in beside.reasons)
+    assert beside.trust is not Trust.NO
 
 
 def test_the_stamps_of_the_truth_are_put_right(tmp_path: Path) -> None:

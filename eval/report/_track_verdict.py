@@ -138,7 +138,7 @@ def _coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
     if covered is None:
         return
     trust, why = Trust.YES, ""
-    if covered < _COVERED and _on_another_clock(data, solution):
+    if covered < _COVERED and _truth_on_another_clock(data):
         trust = Trust.WITH_CARE
         why = ". That says nothing of the track: the truth is on another clock (see the warnings)"
     elif covered < _NOT_COVERED:
@@ -174,7 +174,7 @@ def _heading_coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
         trust, why = Trust.WITH_CARE, "; too small, or in a run of a minute or two chance"
         if headed < _NOT_COVERED:
             why = _constant_heading(data, solution) or "; they are far too small"
-        if _on_another_clock(data, solution):
+        if _truth_on_another_clock(data):
             why = "; that says nothing, either"
     text = (
         f"Its heading bounds ({bound_deg:.2f} deg, median) held the truth for {percent(headed)} of the time{off}{why}."
@@ -182,9 +182,10 @@ def _heading_coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
     yield Reason(trust=trust, text=text)
 
 
-def _on_another_clock(data: ReportData, solution: Solution) -> bool:
+def _truth_on_another_clock(data: ReportData) -> bool:
+    """Return whether the truth has another clock, by the run's own track: that of the online mode is noisier, and may not show it."""
     truth = data.recording.truth
-    apart = None if truth is None else clock_apart(solution.trajectory, truth)
+    apart = None if truth is None else clock_apart(data.solution.trajectory, truth)
     return apart is not None and apart.of_clock
 
 
