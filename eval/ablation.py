@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from graphloc.eval.consistency import Contradiction
 from graphloc.eval.metrics import Levers, errors, held_out_errors
-from graphloc.frames import Array, wrap_angle
+from graphloc.frames import Array
 from graphloc.measurements import GnssPosition
 from graphloc.signals.series import rms
 from graphloc.solution import Solution
@@ -117,12 +117,10 @@ def off(solution: Solution, full: Solution, truth: Trajectory | None, held: Sequ
     if truth is None and held:
         fixes = held_out_errors(solution.trajectory, held, solution.datum, levers).predicted(solution.slow)
         return Off(stamps_ns=fixes.stamps_ns, off_m=fixes.horizontal_m, off_deg=None)
-    found = errors(solution.trajectory, truth or full.trajectory)
-    return Off(
-        stamps_ns=found.stamps_ns,
-        off_m=found.horizontal_m,
-        off_deg=np.degrees(np.abs(wrap_angle(found.heading_rad))),
-    )
+    reference = truth or full.trajectory
+    found = errors(solution.trajectory, reference)
+    off_deg = np.degrees(np.abs(found.heading_rad)) if reference.headed else None
+    return Off(stamps_ns=found.stamps_ns, off_m=found.horizontal_m, off_deg=off_deg)
 
 
 def effect(

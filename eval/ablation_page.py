@@ -42,7 +42,7 @@ def said(ablated: Ablated) -> list[str]:
         lines.append(
             f"{', '.join(ablated.matched)}: its matches were made around the run with all sensors, in each run."
         )
-    return lines
+    return [*lines, *(f"Warning: {text}" for text in ablated.warnings)]
 
 
 def _bought(e: Effect, ablated: Ablated) -> str:

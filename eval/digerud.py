@@ -105,7 +105,7 @@ def run_digerud(recording: Recording, config: VesselConfig) -> FilterResult | No
 def _off_m(p_world_camera: Array, m: TagSighting, truth: Trajectory | None) -> float:
     """Return the error (m) of a camera position: against truth, else against the likeliest pose of all tags in view."""
     there, at = m.modes[0].p_world_camera_m, np.array([m.stamp_ns])
-    if truth is not None and truth.covers(at)[0]:
+    if truth is not None and truth.headed and truth.covers(at)[0]:
         true = truth.at(at)
         there = true.p_world_m[0] + true.R_world_body[0] @ m.t_body_camera_m
     return float(np.linalg.norm(p_world_camera - there))

@@ -37,4 +37,4 @@ def percent(share: float | None) -> str:
 
 def number(value: float | None, digits: int = 3) -> str:
     """Return a number for a table; a dash where there is none."""
-    return "-" if value is None else str(value) if isinstance(value, int) else f"{value:.{digits}f}"
+    return "-" if value is None or np.isnan(value) else str(value) if isinstance(value, int) else f"{value:.{digits}f}"

@@ -32,7 +32,7 @@ img{max-width:100%}ul.warnings{padding-left:1.2rem}li.warning{color:#8a3b00;over
 .shades i{display:inline-block;width:.9rem;height:.8rem;margin:0 .25rem 0 .7rem;vertical-align:-1px;border:1px solid #bbb}
 @media(max-width:600px){.wide{display:none}body{padding:.5rem .6rem 2rem}th,td{padding:.25rem .4rem}table{font-size:.82rem}.verdict{font-size:1rem}}
 @page{size:A4;margin:12mm}
-@media print{body{font-size:10.5pt;max-width:none;padding:0}.figure,table,img{break-inside:avoid}nav,details{display:none}
+@media print{body{font-size:10.5pt;max-width:none;padding:0}.figure,table,img,.svg-container{break-inside:avoid}.svg-container{contain:size}nav,details{display:none}
 .scroll{overflow:visible}th,td{white-space:normal}td.text,td:first-child{overflow-wrap:anywhere}td:first-child{min-width:6.5rem}.figure{overflow:visible}.reason td:first-child{min-width:10rem}.reason td:last-child{min-width:17rem}*{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
 """
 

@@ -67,8 +67,9 @@ class TruthMetrics:
     """Errors against truth: horizontal position (BL eq. 2.29, 2.30) and heading (eq. 2.31, 2.32).
 
     `nees` is of the horizontal position: 2.0, its degrees of freedom, if the covariance is honest. `coverage_95` is the
-    share of stamps at which the 95 % region holds the truth. They are None without a covariance. `matched` is the share
-    of the truth's stamps that the estimate covers.
+    share of stamps at which the 95 % region holds the truth. They are None without a covariance. If the truth has no
+    heading, the errors of the heading are NaN, and its coverage is None. `matched` is the share of the truth's stamps that
+    the estimate covers.
     """
 
     position_rmse_m: float
@@ -107,7 +108,7 @@ class TrackErrors(PositionErrors):
     """Errors against a track.
 
     Attributes:
-        heading_rad: (M,) error of the heading. estimate: the estimate, interpolated at the stamps.
+        heading_rad: (M,) error of the heading; NaN if the truth has none. estimate: the estimate, interpolated at the stamps.
     """
 
     heading_rad: Array
@@ -144,7 +145,7 @@ def errors(estimate: Trajectory, truth: Trajectory) -> TrackErrors:
     return TrackErrors(
         stamps_ns=stamps,
         position_m=there.p_world_m - true.p_world_m,
-        heading_rad=wrap_angle(there.yaw_rad - true.yaw_rad),
+        heading_rad=wrap_angle(there.yaw_rad - true.yaw_rad) if truth.headed else np.full(len(stamps), np.nan),
         estimate=there,
         covered=covered,
     )
@@ -172,7 +173,8 @@ def compare_to_truth(estimate: Trajectory, truth: Trajectory) -> TruthMetrics:
     if there.cov is not None:
         squared = squared_over_covariance(error, there.cov)
         nees, coverage = float(squared.mean()), float((squared <= chi2_95(2)).mean())
-        heading_coverage = float((heading**2 <= chi2_95(1) * there.cov[:, 5, 5]).mean())
+        if truth.headed:
+            heading_coverage = float((heading**2 <= chi2_95(1) * there.cov[:, 5, 5]).mean())
     return TruthMetrics(
         position_rmse_m=rms(horizontal),
         position_p50_m=float(np.percentile(horizontal, 50)),
@@ -341,7 +343,11 @@ _Named = Sequence[tuple[str, Trajectory]]
 def _table(title: str, rows: Sequence[tuple[str, object]], note: str) -> Table:
     dicts = [(name, asdict(row)) for name, row in rows]  # type: ignore[call-overload]
     columns = tuple(dicts[0][1])
-    return Table(title, columns, tuple((n, tuple(d[c] for c in columns)) for n, d in dicts), note)
+    return Table(title, columns, tuple((n, tuple(_measured(d[c]) for c in columns)) for n, d in dicts), note)
+
+
+def _measured(value: float | None) -> float | None:
+    return None if value is None or np.isnan(value) else value
 
 
 def truth_table(estimates: _Named, truth: Trajectory) -> Table:

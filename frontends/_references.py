@@ -50,10 +50,16 @@ class Reference:
 def true_trajectory(item: Reference, offset_s: float, warnings: list[str]) -> Trajectory | None:
     """Return the true trajectory, with velocity; None of fewer than two usable poses. Poses left out give a warning.
 
+    If no quaternion is valid, or all are 0 0 0 1, it is one of positions, without a heading.
+
     Args:
         offset_s: added to its stamps.
     """
     poses = [(s, *pose_of(m), m) for s, m in zip(item.stamps_ns, item.messages, strict=True)]
+    turned = [R for _, _, R, _ in poses if R is not None]
+    headed = bool(turned) and not all(np.array_equal(R, np.eye(3)) for R in turned)
+    if not headed:
+        poses = [(s, p, np.eye(3), m) for s, p, _, m in poses]
     good = [(s, p, R, m) for s, p, R, m in poses if R is not None and (np.abs(p) <= MOST_DISTANCE_M).all()]
     stamps = np.array([s for s, _, _, _ in good], dtype=np.int64)
     keep = np.flatnonzero(_clock.longest_increasing(stamps))
@@ -64,7 +70,7 @@ def true_trajectory(item: Reference, offset_s: float, warnings: list[str]) -> Tr
     stamps = stamps[keep] + round(offset_s * NS_PER_S)
     p, R = np.array([good[i][1] for i in keep]), np.array([good[i][2] for i in keep])
     v = _true_velocity(stamps, p, R, [good[i][3] for i in keep])
-    return Trajectory(stamps_ns=stamps, p_world_m=p, R_world_body=R, v_world_mps=v)
+    return Trajectory(stamps_ns=stamps, p_world_m=p, R_world_body=R, v_world_mps=v, headed=headed)
 
 
 def _true_velocity(stamps_ns: NDArray[np.int64], p_m: Array, R: Array, messages: Sequence[Any]) -> Array:

@@ -22,7 +22,7 @@ _FORM = "stamp x y z qx qy qz qw (s since 1970; m; a unit quaternion)"
 def read_tum(path: Path, offset_s: float = 0.0) -> Trajectory:
     """Return the poses of body in world of a file, with velocity, which is the derivative of the positions.
 
-    Empty lines and lines that begin with # are skipped.
+    Empty lines and lines that begin with # are skipped. A file whose quaternions are all 0 0 0 1 holds positions only.
 
     Args:
         path: of the file. offset_s: added to its stamps.
@@ -56,6 +56,7 @@ def read_tum(path: Path, offset_s: float = 0.0) -> Trajectory:
         stamps_ns=at,
         p_world_m=poses[:, :3],
         R_world_body=Rotation.from_quat(poses[:, 3:]).as_matrix(),
+        headed=bool(poses[:, 3:6].any()),
         v_world_mps=np.gradient(poses[:, :3], seconds_since(int(at[0]), at), axis=0),
     )
 

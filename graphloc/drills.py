@@ -15,6 +15,7 @@ from graphloc.eval import ekf
 from graphloc.eval.drill import Case, DrillWindow, Failure, Measured, Struck, Times, cut, judge, schedule, script
 from graphloc.eval.drill.measure import Drilled, compared
 from graphloc.eval.drill.plan import judged_until, windows
+from graphloc.eval.formatting import percent
 from graphloc.eval.parallel import run_jobs
 from graphloc.frames import Datum, heading_deg_from_yaw
 from graphloc.measurements import CompassHeading
@@ -22,6 +23,7 @@ from graphloc.recording import Progress, Recording, quiet
 from graphloc.replay import replay
 from graphloc.trajectory import Trajectory, bounds_95
 
+_KNOWN = 0.95  # least share of a run that a truth covers, for drills to be judged by it; a choice
 ESTIMATORS = ("graphloc", "graphloc online", "honest EKF", "BL EKF")
 Tracks = dict[str, tuple[Trajectory | None, str]]
 """By estimator, its track, or why there is none."""
@@ -61,7 +63,7 @@ def drill(
         ConfigError: `only` matches none. InputError: no failure fits the recording.
     """
     _refuse_unknown(recording, only)
-    run = app.smooth_recording(recording, config, scans=scans, progress=progress)
+    run = _without_a_truth_of_a_part(app.smooth_recording(recording, config, scans=scans, progress=progress))
     failures, left = script(run.recording, config)
     failures = _wanted(failures, only)
     parts = windows(run.recording, max(f.length_s for f in failures), times)
@@ -81,6 +83,15 @@ def drill(
         windows=parts,
         warnings=run.recording.warnings,
     )
+
+
+def _without_a_truth_of_a_part(run: app.Run) -> app.Run:
+    """Drop a truth that does not cover nearly all of a run, and say so: no drill beyond it could be judged."""
+    truth = run.recording.truth
+    if truth is None or (known := float(truth.covers(run.solution.trajectory.stamps_ns).mean())) >= _KNOWN:
+        return run
+    said = f"the truth covers {percent(known)} of the run, too little for drills: the undisturbed offline solution is the reference"
+    return replace(run, recording=replace(run.recording, truth=None, warnings=(*run.recording.warnings, said)))
 
 
 class _Bench:

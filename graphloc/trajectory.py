@@ -32,6 +32,7 @@ class Trajectory:
         v_world_mps: (N, 3), or None where velocity is not known (then interpolation is linear).
         cov: (N, 6, 6) or None: x, y, z (m) and small rotations (rad), all about the world's axes.
         planar: whether height, roll and pitch are not estimated.
+        headed: whether its rotations are known; if not, as of a prism or an antenna that is the truth, they are the identity.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -40,6 +41,7 @@ class Trajectory:
     v_world_mps: Array | None = None
     cov: Array | None = None
     planar: bool = False
+    headed: bool = True
 
     def __post_init__(self) -> None:
         n = len(self.stamps_ns)
@@ -122,6 +124,7 @@ class Trajectory:
             v_world_mps=velocity,
             cov=cov,
             planar=self.planar,
+            headed=self.headed,
         )
 
     def poses_at(self, stamps_ns: NDArray[np.int64]) -> tuple[Array, Array]:

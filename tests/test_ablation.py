@@ -87,6 +87,7 @@ def test_a_bad_compass_shows_without_truth(bad: tuple[SimulatedRun, Ablated]) ->
     text = "\n".join(page.said(found))
     assert "CONTRADICTION: compass" in text
     assert "does not measure accuracy" in text
+    assert "Warning: /truth: on another clock" in page.said(replace(found, warnings=("/truth: on another clock",)))
     # the matcher knows the heading, too, and is as far from the compass as that from it: fixes that may drift by 2 m do not tell
     assert "it cannot tell which is wrong" in text
     assert (of(found, "gnss").contradiction or 0.0) < 1.5

@@ -408,6 +408,10 @@ def test_a_drill_from_recording_to_page(drilled: tuple[SimulatedRun, Drilled], t
     assert {r["estimator"] for r in told["rows"]} == set(by)
     assert len((tmp_path / "drill.csv").read_text().splitlines()) == 1 + len(by)
     assert "| IMU gap, 1 s |" in (tmp_path / "drill.md").read_text()
+    # As of a truth in GPS time: against that no estimator comes back, and only drill.json said why.
+    page.write(replace(found, warnings=("/truth: on another clock",)), tmp_path, "drill")
+    for name in ("drill.html", "drill.md"):
+        assert "Warning: /truth: on another clock" in (tmp_path / name).read_text()
 
 
 def test_an_estimator_has_the_colour_that_it_has_in_the_report(drilled: tuple[SimulatedRun, Drilled]) -> None:

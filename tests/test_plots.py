@@ -247,3 +247,21 @@ def test_an_image_that_cannot_be_had_is_reported_and_the_map_is_plain(tmp_path: 
     assert under is None
     assert "gone.tif" in said
     assert underlay(VesselConfig(), tmp_path, Datum(SWEDEN), np.zeros((2, 3))) == (None, "")
+
+
+def test_no_name_of_a_legend_leaves_the_sheet() -> None:
+    """Of held-out fixes names are long: four to a row were 7.4 in wide, and 'graphloc online, held-out' was cut off."""
+    names = ("lost", "no GNSS fix", "degraded", "95 % bound of graphloc", "honest EKF, held-out", "BL EKF, held-out")
+    one = np.zeros(1)
+    lines = [
+        plots.Line(name=n, x=one, y=one, colour="#000000")
+        for n in (*names, "graphloc online, held-out", "graphloc, held-out")
+    ]
+    for named in (lines, lines[:2]):
+        sheet = on_paper(
+            plots.Figure(name="errors", x="s", panels=(plots.Panel(title="", y="m", marks=tuple(named)),), height=400)
+        )
+        sheet.canvas.draw()
+        (legend,) = sheet.legends
+        assert len(legend.get_texts()) == len(named)
+        assert legend.get_window_extent().x1 <= sheet.bbox.x1

@@ -17,6 +17,7 @@ from graphloc.eval.formatting import significant
 from graphloc.eval.metrics import Table
 from graphloc.eval.plots import Underlay
 from graphloc.eval.report import ReportData, Trust, figures, theses_section, verdict, write_report
+from graphloc.eval.report._sections import first_screen
 from graphloc.eval.simulate import Scenario
 from graphloc.measurements import GnssPosition
 from graphloc.solution import Solution
@@ -99,8 +100,10 @@ def test_no_ratio_is_given_to_an_error_over_another_time(data: ReportData, share
     """Online had 350 of 400 fixes, without the first gap, in which the filters were worst: 'BL EKF 4.1 x' was of all 400."""
     columns = ("position_rmse_m", "coverage_95", "matched")
     table = Table("Against truth", columns, (("graphloc", (0.1234, 0.95, share)), ("BL EKF", (1.5, None, 1.0))))
-    accuracy = verdict(replace(data, tables=(table,))).tracks[0].accuracy
+    told = replace(data, tables=(table,))
+    accuracy = verdict(told).tracks[0].accuracy
     assert accuracy.endswith(said)
+    assert ("<td>12 x</td>" in first_screen(told, verdict(told))) == (share > 0.9)  # nor in the table under it
     assert ("over the 88 % that it covers" in accuracy) == (share < 0.9)
 
 

@@ -105,21 +105,33 @@ def test_too_little_time_in_common_tells_nothing() -> None:
     assert clock_apart(track, replace(far, stamps_ns=np.append(far.stamps_ns[:-1], far.stamps_ns[-1] + 10**16))) is None
 
 
-def test_a_run_says_so_of_its_truth() -> None:
-    """The truth of a run in GPS time, and the same put right."""
+@pytest.mark.parametrize("by_s", [18.0, 40.0])
+def test_a_run_says_so_of_its_truth(by_s: float) -> None:
+    """The truth of a run in GPS time, or on a clock that is off by most of the run, and the same put right."""
     quick = Scenario(
         path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0
     )
     run = simulate_slowly(quick, 78)
-    late = app.smooth_recording(replace(run.recording, truth=later(run.truth, 18.0)), run.config)
+    late = app.smooth_recording(replace(run.recording, truth=later(run.truth, by_s)), run.config)
     (said,) = (w for w in late.warnings if "truth_time_offset_s" in w)
     named = re.search(r"^/truth: .* set truth_time_offset_s: (-?[\d.]+)$", said)
     assert named
-    assert float(named[1]) == pytest.approx(-18.0, abs=0.1)
+    assert float(named[1]) == pytest.approx(-by_s, abs=0.1)
     (track,) = verdict(app.report_data(late)).tracks
     assert any("truth is on another clock" in reason.text for reason in track.reasons)
     assert not any(reason.trust is Trust.NO for reason in track.reasons)
     assert clock_apart(late.solution.trajectory, run.truth) is None
+    # Of the online track, whose velocities are too noisy to show it, 'do not rely on it' was said: the truth were an antenna 43 m astern.
+    solution, data = late.solution, app.report_data(late)
+    v = solution.trajectory.v_world_mps
+    assert v is not None
+    noisy = replace(solution.trajectory, v_world_mps=v + np.random.default_rng(0).normal(size=v.shape))
+    assert clock_apart(noisy, later(run.truth, by_s)) is None
+    online = replace(solution, trajectory=noisy, stats=replace(solution.stats, online=True))
+    table = replace(data.tables[0], rows=(*data.tables[0].rows, ("graphloc online", data.tables[0].rows[0][1])))
+    beside = verdict(replace(data, online=online, tables=(table,))).tracks[1]
+    assert any("truth is on another clock" in reason.text for reason in beside.reasons)
+    assert beside.trust is not Trust.NO
 
 
 def test_the_stamps_of_the_truth_are_put_right(tmp_path: Path) -> None:

@@ -99,7 +99,8 @@ def compared(track: Trajectory | None, reference: Trajectory, window: DrillWindo
         assert ours.cov is not None
         cov = ours.cov[:, :2, :2] + (0.0 if sure or true.cov is None else true.cov[:, :2, :2])
         off_m[there] = np.hypot(*error.T)
-        off_deg[there] = np.degrees(np.abs(wrap_angle(ours.yaw_rad - true.yaw_rad)))
+        if reference.headed:
+            off_deg[there] = np.degrees(np.abs(wrap_angle(ours.yaw_rad - true.yaw_rad)))
         held[there] = squared_over_covariance(error, cov) <= chi2_95(2)
     return Times(stamps_ns=stamps, there=there, off_m=off_m, off_deg=off_deg, held=held)
 

@@ -25,7 +25,7 @@ def said(drilled: Drilled) -> list[str]:
         lines.append("Reference: truth, which no estimator sees; the EKFs are started at it, as in the thesis.")
     else:
         lines.append(
-            "Reference: the undisturbed offline solution, as there is no truth. It shares its fixes with everything that is "
+            "Reference: the undisturbed offline solution, as no truth covers the run. It shares its fixes with everything that is "
             f"judged, and its own 95 % bound is {drilled.bound_m:.1f} m (median): smaller differences mean "
             "little, its covariance is added when coverage is judged, and 'graphloc' is nearest to it by construction."
         )
@@ -35,7 +35,7 @@ def said(drilled: Drilled) -> list[str]:
             f"The recording is long: each failure was drilled in {len(drilled.windows)} windows of {seconds:.0f} s. Without "
             "a heading sensor, a window starts with the heading that the undisturbed run had there."
         )
-    return lines
+    return [*lines, *(f"Warning: {text}" for text in drilled.warnings)]
 
 
 def _headline(drilled: Drilled, rows: Sequence[Row]) -> list[str]:

@@ -12,12 +12,14 @@ from __future__ import annotations
 from graphloc.config import VesselConfig
 from graphloc.eval.ekf._bl import BlConfig, run_bl
 from graphloc.eval.ekf._honest import run_honest
-from graphloc.eval.ekf._inputs import as_pose
+from graphloc.eval.ekf._inputs import as_pose, starts_at_truth
 from graphloc.eval.ekf._planar import FilterResult, filter_row, named_tracks
 from graphloc.frames import Datum
 from graphloc.recording import Recording
 
-__all__ = ["BlConfig", "FilterResult", "as_pose", "filter_row", "named_tracks", "run_all", "run_bl", "run_honest"]
+__all__ = [
+    "BlConfig", "FilterResult", "as_pose", "filter_row", "named_tracks", "run_all", "run_bl", "run_honest", "starts_at_truth",
+]  # fmt: skip
 
 
 def run_all(

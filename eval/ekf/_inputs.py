@@ -113,11 +113,18 @@ def as_pose(m: TagSighting, survey: Survey) -> PoseFix:
     return PoseFix(stamp_ns=m.stamp_ns, sensor=m.sensor, seq=m.seq, axes=("x", "y", "yaw"), modes=tuple(modes))
 
 
+def starts_at_truth(recording: Recording) -> bool:
+    """Return whether the truth holds the pose at which a filter starts."""
+    truth, imu = recording.truth, recording.imu
+    return truth is not None and truth.headed and imu is not None and bool(truth.covers(imu.stamps_ns[:1]).all())
+
+
 def start_of(measured: list[MountedMeasurement], recording: Recording, datum: Datum) -> Array:
     """Return the first five states (5,) as BL chooses them: the true pose, else by the first fixes and heading."""
-    truth, imu = recording.truth, recording.imu
-    if truth is not None and imu is not None and truth.covers(imu.stamps_ns[:1]).all():
-        there = truth.at(imu.stamps_ns[:1])
+    if starts_at_truth(recording):
+        assert recording.truth is not None
+        assert recording.imu is not None
+        there = recording.truth.at(recording.imu.stamps_ns[:1])
         v = there.R_world_body[0].T @ there.v_world_mps[0] if there.v_world_mps is not None else np.zeros(3)
         return np.array([*there.p_world_m[0, :2], v[0], v[1], there.yaw_rad[0]])
     fixes = [e.m for e in measured if isinstance(e.m, GnssPosition)]

@@ -67,7 +67,8 @@ def error_over_time(
             off = errors(estimate, recording.truth)
             size = off.horizontal_m
             width = 2.0 if who == solution.name else 1.3
-            for marks, value in ((position, size), (heading, np.degrees(np.abs(off.heading_rad)))):
+            both = [(position, size), (heading, np.degrees(np.abs(off.heading_rad)))]
+            for marks, value in both if recording.truth.headed else both[:1]:
                 at = peaks(value)
                 s = seconds_since(start, off.stamps_ns[at])
                 marks.append(Line(name=who, x=s, y=value[at], colour=colour, width=width))
@@ -83,7 +84,7 @@ def error_over_time(
     title, limit = _zoomed(largest_m) if largest_m else ("position, 95 % bound", None)
     panels = (
         Panel(title=title, y="m", marks=tuple(position), from_zero=True, range_y=limit),
-        Panel(title="heading error" if recording.truth else "heading, 95 % bound", y="deg", marks=tuple(heading), from_zero=True),
+        Panel(title="heading error" if recording.truth and recording.truth.headed else "heading, 95 % bound", y="deg", marks=tuple(heading), from_zero=True),
     )  # fmt: skip
     return Figure(name="errors", x="time, s", panels=panels, height=540)
 

@@ -66,8 +66,11 @@ def drawn(figure: Figure) -> Sheet:
             axes.legend(loc="upper right", ncols=3, fontsize=7)
         else:
             named |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    if named:
-        sheet.legend(list(named.values()), list(named), loc="outside upper left", ncols=min(len(named), 4))
+    for columns in range(min(len(named), 4), 0, -1):
+        legend = sheet.legend(list(named.values()), list(named), loc="outside upper left", ncols=columns)
+        if legend.get_window_extent().width <= sheet.bbox.width or columns == 1:
+            break
+        legend.remove()  # the names of held-out fixes are long
     return sheet
 
 

@@ -92,7 +92,7 @@ def cure(health: Health, reason: HealthReason) -> str:
         return (
             "a better fix, or a second position sensor (match, tag); where a wider bound will do, output.good_bound_m"
         )
-    return "correcting what the warnings name: noise, mounts, stamps"
+    return "agreement again; where the warnings name a noise, a mount or stamps, correcting that"
 
 
 def section(solutions: Sequence[Solution], begin_ns: int) -> str:

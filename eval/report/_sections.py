@@ -11,7 +11,7 @@ from graphloc.eval.html import note, table
 from graphloc.eval.metrics import Table
 from graphloc.eval.plots import HEALTH, OUTAGE
 from graphloc.eval.report._data import ReportData
-from graphloc.eval.report._track_verdict import Trust, main_table, times
+from graphloc.eval.report._track_verdict import Row, Trust, main_table, over_one_time, times
 from graphloc.eval.report._verdict import RunVerdict
 from graphloc.solution import Solution
 
@@ -82,7 +82,7 @@ def _key_table(whole: Table, key: str, ours: str) -> str:
         [
             name,
             number(row[first[0]], first[2]),
-            "" if name == ours else _ratio(row[key], values[ours][key]),
+            "" if name == ours else _ratio(row, values[ours], key),
             *(number(row[c], digits) for c, _, digits in columns),
             *(percent(row[c]) for c, _ in shares),
         ]
@@ -92,8 +92,9 @@ def _key_table(whole: Table, key: str, ours: str) -> str:
     return table(head, rows, ["ours" if name == ours else "" for name in values], wide=wide, kind="key")
 
 
-def _ratio(theirs: float | None, ours: float | None) -> str:
-    return times(theirs, ours) if ours and theirs is not None else ""
+def _ratio(theirs: Row, ours: Row, key: str) -> str:
+    value, mine = theirs[key], ours[key]
+    return times(value, mine) if mine and value is not None and over_one_time(theirs, ours) else ""
 
 
 def warnings_list(data: ReportData) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +16,9 @@ from graphloc.eval.formatting import percent
 from graphloc.eval.metrics import Table, errors, held_out_errors, receiver_errors, squared_over_covariance
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
+from graphloc.eval.report._one_cause import one_cause
 from graphloc.eval.truth_clock import clock_apart
-from graphloc.frames import Array
+from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import GnssPosition
 from graphloc.signals.frozen_receiver import FROZEN
 from graphloc.signals.series import rms
@@ -48,6 +49,10 @@ _STAYS = 0.5
 # the online track starts seconds later.
 _ALIKE = 0.1
 _WORSE = 1.05  # ratio of our error to a filter's from which the filter is reported as more accurate
+
+
+Row = Mapping[str, float | None]
+"""Of one estimate, its numbers by name."""
 
 
 class Trust(enum.IntEnum):
@@ -133,36 +138,26 @@ def _coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
     if covered is None:
         return
     trust, why = Trust.YES, ""
-    truth = data.recording.truth
-    apart = clock_apart(solution.trajectory, truth) if covered < _COVERED and truth is not None else None
-    if apart is not None and apart.of_clock:
+    if covered < _COVERED and _truth_on_another_clock(data):
         trust = Trust.WITH_CARE
         why = ". That says nothing of the track: the truth is on another clock (see the warnings)"
     elif covered < _NOT_COVERED:
         trust = Trust.NO
         why = (
-            _constant(data, solution)
+            _explained(data, solution)
             or ". The bounds are far too small: a mount, the datum, a clock or a noise is wrong"
         )
     elif covered < _COVERED or (nees is not None and nees > _TOO_SURE):
-        trust, why = Trust.WITH_CARE, _constant(data, solution) or "; they are too small"
+        trust, why = Trust.WITH_CARE, _explained(data, solution) or "; they are too small"
     beside = "" if nees is None else f" (NEES {nees:.1f}; 2 where they are honest)"
     yield Reason(trust=trust, text=f"Its 95 % bounds held the truth for {percent(covered)} of the time{beside}{why}.")
 
 
-def _constant(data: ReportData, solution: Solution) -> str:
-    """Return a sentence on the position error if most of it is constant; else empty."""
+def _explained(data: ReportData, solution: Solution) -> str:
+    """Return what explains most of the position error; empty if nothing simple does."""
     if data.recording.truth is None:
         return ""
-    off = errors(solution.trajectory, data.recording.truth).position_m[:, :2]
-    east, north = mean = off.mean(axis=0)
-    rest = rms(np.linalg.norm(off - mean, axis=1))
-    if rest >= _STAYS * np.linalg.norm(mean):
-        return ""
-    return (
-        f". All but {rest:.2f} m (RMS) of its error stays the same, {abs(east):.2f} m {'east' if east > 0.0 else 'west'} and {abs(north):.2f} m "
-        f"{'north' if north > 0.0 else 'south'} of the truth: the datum, where an image or a survey lies, or a mount is wrong, or a receiver drifts for longer than the run"
-    )
+    return one_cause(errors(solution.trajectory, data.recording.truth), data.config.truth_time_offset_s)
 
 
 def _heading_coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
@@ -177,10 +172,36 @@ def _heading_coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
     trust, why = Trust.YES, ""
     if headed < _COVERED:
         trust, why = Trust.WITH_CARE, "; too small, or in a run of a minute or two chance"
+        if headed < _NOT_COVERED:
+            why = _constant_heading(data, solution) or "; they are far too small"
+        if _truth_on_another_clock(data):
+            why = "; that says nothing, either"
     text = (
         f"Its heading bounds ({bound_deg:.2f} deg, median) held the truth for {percent(headed)} of the time{off}{why}."
     )
     yield Reason(trust=trust, text=text)
+
+
+def _truth_on_another_clock(data: ReportData) -> bool:
+    """Return whether the truth has another clock, by the run's own track: that of the online mode is noisier, and may not show it."""
+    truth = data.recording.truth
+    apart = None if truth is None else clock_apart(data.solution.trajectory, truth)
+    return apart is not None and apart.of_clock
+
+
+def _constant_heading(data: ReportData, solution: Solution) -> str:
+    """Return a clause on the heading error if most of it is constant; else empty."""
+    if data.recording.truth is None:
+        return ""
+    off = errors(solution.trajectory, data.recording.truth).heading_rad
+    mean = float(np.angle(np.exp(1j * off).mean()))
+    rest = rms(wrap_angle(off - mean))
+    if rest >= _STAYS * abs(mean):
+        return ""
+    return (
+        f"; all but {np.degrees(rest):.2f} deg (RMS) of that stays the same, to {'port' if mean > 0.0 else 'starboard'}: a mount, a compass or "
+        "the axes of the truth"
+    )
 
 
 def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
@@ -420,7 +441,14 @@ def _from_offline(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 def _compared(data: ReportData, solution: Solution) -> Iterator[Reason]:
     """Yield a sentence if accuracy was not measured, or over a part of the run only."""
-    if main_table(data) is None:
+    found = main_table(data)
+    if found is not None and found[0].as_dict().get(solution.name, {}).get(found[1]) is None:
+        yield Reason(
+            trust=Trust.WITH_CARE,
+            text="Its accuracy was not measured: it shares no time with what the others are measured against.",
+        )
+        return
+    if found is None:
         text = "Its accuracy was not measured: there is neither truth nor a held-out fix."
         if solution.stats.online and data.online is None:
             text += " `graphloc compare` compares it with the offline track, which knows more."
@@ -493,8 +521,7 @@ def _accuracy(data: ReportData, name: str) -> str:
             else f", over the {percent(covered)} that it covers"
         )
     others = {n: v for n, row in values.items() if n != name and (v := row[key]) is not None}
-    # No ratio to an error over a time that our track lacks, as the time before its start.
-    alike = {n for n in others if abs((values[n].get("matched") or 1.0) - covered) <= _ALIKE}
+    alike = {n for n in others if over_one_time(values[n], values[name])}
     if name != data.solution.name:  # the online track is not compared with the offline one, which knows later data
         others.pop(data.solution.name, None)
     beside = ", ".join(
@@ -502,6 +529,14 @@ def _accuracy(data: ReportData, name: str) -> str:
         for n, value in others.items()
     )
     return f"{said}; beside it: {beside}." if beside else f"{said}."
+
+
+def over_one_time(one: Row, other: Row) -> bool:
+    """Return whether two estimates cover about as much of the reference.
+
+    There is no ratio to an error over a time that our track lacks, as the time before its start.
+    """
+    return abs((one.get("matched") or 1.0) - (other.get("matched") or 1.0)) <= _ALIKE
 
 
 def times(value: float, mine: float) -> str:

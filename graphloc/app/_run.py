@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from graphloc.build import mount_of
 from graphloc.config import VesselConfig
 from graphloc.eval import calibrate, ekf, metrics, report
@@ -15,6 +17,8 @@ from graphloc.measurements import GnssPosition
 from graphloc.recording import Recording
 from graphloc.solution import Solution
 from graphloc.survey import TagConfig
+from graphloc.time import stamps_of
+from graphloc.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,7 +46,8 @@ def made_comparable(run: Run) -> Run:
     """Drop what shares no time with the track, and say so; say so, too, of a truth whose clock is another one."""
     truth, speed, held, track = run.recording.truth, run.recording.check_speed, run.held, run.solution.trajectory
     said: list[str] = []
-    if truth is not None and (apart := clock_apart(track, truth)) is not None:
+    apart = None if truth is None else clock_apart(track, truth)
+    if apart is not None:
         said.append(apart.said(run.config.truth or "truth", run.config.truth_time_offset_s))
 
     def comparable(compare: Callable[..., object], *arguments: object) -> bool:
@@ -53,6 +58,8 @@ def made_comparable(run: Run) -> Run:
             return False
         return True
 
+    if truth is not None and not (apart is not None and apart.of_clock):  # else the report shows it by all of the truth
+        truth = _during(run.recording, truth)
     if truth is not None and not comparable(metrics.common_stamps, track, truth):
         truth = None
     if speed is not None and not comparable(metrics.compare_speed, track, speed):
@@ -61,11 +68,13 @@ def made_comparable(run: Run) -> Run:
         held = ()
 
     def fits(filtered: ekf.FilterResult) -> bool:
-        return (truth is None or comparable(metrics.common_stamps, filtered.trajectory, truth)) and (
-            not held
-            or comparable(
-                metrics.held_out_errors, filtered.trajectory, held, run.solution.datum, antennas(run).configured
+        if truth is not None and not filtered.trajectory.covers(truth.stamps_ns).any():
+            said.append(
+                f"{filtered.name}: not compared, as it begins after the last pose of the truth or ends before the first"
             )
+            return False
+        return not held or comparable(
+            metrics.held_out_errors, filtered.trajectory, held, run.solution.datum, antennas(run).configured
         )
 
     filters = tuple(f for f in run.filters if fits(f))
@@ -74,6 +83,19 @@ def made_comparable(run: Run) -> Run:
         online = None
     recording = replace(run.recording, truth=truth, check_speed=speed, warnings=(*run.recording.warnings, *said))
     return replace(run, recording=recording, held=held, filters=filters, online=online)
+
+
+def _during(recording: Recording, truth: Trajectory) -> Trajectory:
+    """Return the part of a truth that is of a run, with a pose on either side, to interpolate; the whole if none is.
+
+    A logger that ran for longer does not make the track miss a part.
+    """
+    assert recording.imu is not None  # it was solved
+    stamps = np.concatenate([recording.imu.stamps_ns, stamps_of(recording.measurements)])
+    before = int(np.searchsorted(truth.stamps_ns, stamps.min(), side="right")) - 1
+    after = int(np.searchsorted(truth.stamps_ns, stamps.max(), side="left"))
+    during = truth.where(slice(max(before, 0), after + 1))
+    return during if len(during) > 1 else truth
 
 
 def antennas(run: Run) -> metrics.Antennas:

@@ -10,12 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
+
 from graphloc import found_tags, outputs
 from graphloc.app._run import Run, antennas
 from graphloc.config import load_config
 from graphloc.eval import metrics, report
 from graphloc.eval.docking import docking_table
-from graphloc.eval.ekf import named_tracks
+from graphloc.eval.ekf import named_tracks, starts_at_truth
 from graphloc.eval.holdout import suggested
 from graphloc.factors import KINDS
 from graphloc.folders import fresh_folder
@@ -24,13 +26,20 @@ from graphloc.measurements import GnssPosition, TagSighting
 from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
+_NEARLY_ALL = 0.95  # share of a run from which a truth is said to be of all of it; a choice
+
 
 def tables(run: Run) -> tuple[metrics.Table, ...]:
     """Return the numbers of a run: against truth, held-out fixes, and the speed check."""
     found: list[metrics.Table] = []
     estimates = named_tracks(run.solution, run.filters)
     if run.recording.truth is not None:
-        found.append(metrics.truth_table(estimates, run.recording.truth))
+        table, lasts = (
+            metrics.truth_table(estimates, run.recording.truth),
+            _lasts(run.recording.truth, run.solution.trajectory),
+        )
+        part = f"; the truth covers {lasts}" if "of the run" in lasts else ""
+        found.append(replace(table, note=table.note + part))
         found += _docking_tables(run, estimates, run.recording.truth)
     if run.held:
         slow = {s.name: s.slow for s in (run.solution, run.online) if s is not None}
@@ -59,12 +68,11 @@ def truth_statement(run: Run) -> str:
     """Say plainly what the numbers were measured against."""
     if run.recording.truth is not None:
         truth = run.recording.truth
-        span_s = (int(truth.stamps_ns[-1]) - int(truth.stamps_ns[0])) / 1e9
         named = run.config.truth or "given with the recording"
-        imu = run.recording.imu
-        begun = bool(run.filters) and imu is not None and bool(truth.covers(imu.stamps_ns[:1]).all())
+        begun = bool(run.filters) and starts_at_truth(run.recording)
         started = " The EKFs are started at it, as BL started theirs; graphloc is not." if begun else ""
-        return f"Truth: {named}, {len(truth)} poses over {span_s:.0f} s; it was not fused.{started}"
+        poses = "poses" if truth.headed else "positions without a heading"
+        return f"Truth: {named}, {len(truth)} {poses} over {_lasts(truth, run.solution.trajectory)}; it was not fused.{started}"
     if run.held:
         sensors = [row.sensor for row in run.recording.rows if row.outcome is Outcome.HELD_OUT]
         velocities = sum(name in run.config.of_kind("gnss_velocity") for name in sensors)
@@ -90,6 +98,14 @@ def truth_statement(run: Run) -> str:
     return (
         f"{said}. `graphloc compare --hold-out {by}` does." if by else f"{said}; a `truth_topic` or `truth_file` would."
     )
+
+
+def _lasts(truth: Trajectory, track: Trajectory) -> str:
+    """Say for how long a truth is known, gaps left out, and of how long a run if that is less than nearly all of it."""
+    steps_s = np.diff(truth.stamps_ns) / 1e9
+    known_s = float(steps_s[steps_s <= max(2.5 * float(np.median(steps_s)), 1.0)].sum())
+    run_s = float(track.stamps_ns[-1] - track.stamps_ns[0]) / 1e9
+    return f"{known_s:.0f} s" + ("" if known_s > _NEARLY_ALL * run_s else f" of the run's {run_s:.0f} s")
 
 
 def _titled(vessel: str, source: str) -> str:
