@@ -208,7 +208,7 @@ def track(fixes: TopicData) -> tuple[NDArray[np.int64], Array, Array]:
     keep, rows = _placed(fixes)
     there = ~stored(fixes.stamps_ns[keep], rows[:, :3])
     keep, rows = keep[there], rows[there]
-    near = ~far_fixes_of(rows[:, :3])
+    near = ~far_fixes_of(fixes.stamps_ns[keep], rows[:, :3])
     keep, rows = keep[near], rows[near]
     if len(keep) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), rows

@@ -19,7 +19,7 @@ from graphloc.signals.rates_in_degrees import swing_of_degrees, turns_gravity, w
 from graphloc.time import NS_PER_S
 
 FAR_M = 100e3
-"""A fix this far from the middle of its run is not believed."""
+"""A fix this far from the middle of its run is not believed, unless the fixes in between lead there."""
 NEVER_STILL_RADPS = 0.5
 """Median rate that no vessel keeps up for a whole run (29 deg/s)."""
 HALF = "half an IMU, and both halves must come in one message (RealSense: unite_imu_method)"
@@ -27,6 +27,7 @@ FAR_LEVER_M = 50.0
 """A sensor this far from the origin of body is on a ship, or its mount is not in metres."""
 # A single fix is wrong that is so far off those around it, in m, by an acceleration, and in distances between these two: choices
 _LONE_M, _LONE_MPS2, _LONE_APART = 10.0, 20.0, 3.0
+_FASTEST_MPS = 300.0  # no craft goes as far as `FAR_M` faster than this
 _FEWEST = 100  # so many samples are not all 0 by chance
 _LEAST_RANGE_MPS2, _LEAST_RANGE_RADPS = 19.0, 1.7  # no IMU has a smaller range (2 g, 100 deg/s)
 # Fewer readings at the end of the range may be chance; the band beneath the end (a share of it) must hold no more.
@@ -195,14 +196,29 @@ def refuse_degrees(
         )
 
 
-def far_fixes_of(lla: Array) -> NDArray[np.bool_]:
-    """Return (N,) whether a position (N, 3), deg, deg, m, is farther than `FAR_M` from the median of all."""
+def far_fixes_of(stamps_ns: NDArray[np.int64], lla: Array) -> NDArray[np.bool_]:
+    """Return (N,) whether positions (N, 3), deg, deg, m, are farther than `FAR_M` from the median of all.
+
+    Not those to which the run leads from there, by no step as far as that, or none faster than any craft. Stamps (N,)
+    are in order.
+    """
     if len(lla) == 0:
         return np.zeros(0, dtype=bool)
     lon = float(np.median(continuous_longitudes(lla[:, 1])))
     middle = Datum(Geodetic(float(np.median(lla[:, 0])), lon, float(np.median(lla[:, 2]))))
-    enu = middle.enu_from_geodetic(lla[:, 0], lla[:, 1], lla[:, 2])
-    return np.asarray(np.linalg.norm(enu, axis=1) > FAR_M)
+    p_m = middle.enu_from_geodetic(lla[:, 0], lla[:, 1], lla[:, 2])
+    away_m = np.linalg.norm(p_m, axis=1)
+    far = np.asarray(away_m > FAR_M)
+    if not far.any():
+        return far
+    begin = int(away_m.argmin())
+    for way in (range(begin, len(lla)), range(begin, -1, -1)):
+        last = begin
+        for k in way:
+            most_m = max(FAR_M, _FASTEST_MPS * abs(int(stamps_ns[k]) - int(stamps_ns[last])) / NS_PER_S)
+            far[k] = far[k] and float(np.linalg.norm(p_m[k] - p_m[last])) > most_m
+            last = last if far[k] else k
+    return far
 
 
 def lone_fixes(stamps_ns: NDArray[np.int64], p_m: Array) -> NDArray[np.bool_]:
@@ -224,8 +240,11 @@ def lone_fixes(stamps_ns: NDArray[np.int64], p_m: Array) -> NDArray[np.bool_]:
 
 
 def far_fixes(fixes: Sequence[GnssPosition]) -> NDArray[np.bool_]:
-    """Return (N,) whether a fix is farther than `FAR_M` from the median of all fixes."""
-    return far_fixes_of(np.array([f.position for f in fixes]).reshape(-1, 3))
+    """Return (N,) whether a fix is far from all others, see `far_fixes_of`; they may come in any order."""
+    stamps_ns = np.array([f.stamp_ns for f in fixes], dtype=np.int64)
+    order, far = np.argsort(stamps_ns, kind="stable"), np.zeros(len(fixes), dtype=bool)
+    far[order] = far_fixes_of(stamps_ns[order], np.array([f.position for f in fixes]).reshape(-1, 3)[order])
+    return far
 
 
 def far_pose(pose: PoseFix) -> bool:

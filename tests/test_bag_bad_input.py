@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.errors import InputError
 from graphloc.frontends._clock import longest_increasing, steady_logs
-from graphloc.frontends._sanity import turns_gravity
+from graphloc.frontends._sanity import far_fixes_of, turns_gravity
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag
 from graphloc.ledger import Outcome
@@ -373,6 +373,17 @@ def test_fixes_at_null_island_and_far_away(tmp_path: Path) -> None:
     assert "0, 0" in null.reason
     assert "100 km" in far.reason
     assert len(recording.measurements) == 20
+
+
+def test_a_run_may_lead_far_away() -> None:
+    """3 h at 30 m/s: of 324 km the first and the last hour were over 100 km from the middle, and lost. A ferry lands 300 km on after a pause."""
+    t_s = np.r_[0.0:10_800.0:10.0, 16_000.0:17_000.0:10.0]
+    km = np.where(t_s < 10_800.0, 0.03 * t_s, 624.0)
+    lla = np.column_stack([50.0 + km / 111.2, np.full(len(km), 10.0), np.full(len(km), 40.0)])
+    astray = np.zeros(len(km), dtype=bool)
+    astray[[0, 1, 2, 500, 1100]] = True  # a receiver that begins elsewhere, single fixes, and one beside the berth
+    lla[astray, 1] = 14.0
+    assert (far_fixes_of((t_s * 1e9).astype(np.int64), lla) == astray).all()
 
 
 def test_compass_with_nan_roll_and_pitch(tmp_path: Path) -> None:
