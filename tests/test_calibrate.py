@@ -23,7 +23,9 @@ from graphloc.judge.linearised import normal_solver
 from graphloc.measurements import GnssVelocity, ImuSeries
 from graphloc.offsets import Misfit, Offset, Offsets, joined
 from graphloc.signals.imu_scatter import noise_density
+from graphloc.solution import Health
 from graphloc.solve import smooth
+from graphloc.trajectory import bounds_95
 from tests.bagfactory import Messages
 from tests.heldbags import read_recording
 from tests.slowly import simulate_slowly
@@ -185,8 +187,16 @@ def test_fixes_that_are_late_are_found(simulated: SimulatedRun) -> None:
         for m in simulated.recording.measurements
     )
     recording = replace(simulated.recording, measurements=tuple(sorted(late, key=lambda m: m.stamp_ns)))
-    (only,) = calibration_of(recording, simulated.config).suggestions
+    run = app.smooth_recording(recording, simulated.config)
+    assert run.calibration is not None
+    (only,) = run.calibration.suggestions
     assert only.key == "sensors.gnss.time_offset_s"
+    track, true = run.solution.trajectory, simulated.truth.at(run.solution.trajectory.stamps_ns)
+    assert track.cov is not None
+    behind_m = np.linalg.norm((track.p_world_m - true.p_world_m)[:, :2], axis=1)
+    assert (behind_m > bounds_95(track.cov)[:, 0]).mean() > 0.5, "the bounds do not know it"
+    assert Health.GOOD not in run.solution.health
+    assert [why for why in run.solution.doubts if "gnss and the IMU are 0.1" in why]
     assert abs(only.suggested + LATE_S) < 4.0 * only.sigma
     assert only.sigma < 0.03
 

@@ -85,6 +85,24 @@ def test_what_only_looks_so_is_believed(case: str) -> None:
     assert not any(as_it_comes(samples))
 
 
+@pytest.mark.parametrize("step_radps", [0.01, np.radians(0.2)])
+def test_a_gyroscope_that_a_driver_rounds_is_believed_when_it_stands(step_radps: float) -> None:
+    """It shakes for 5 s, then stands: noise of a tenth of a step leaves one triple of rates, while the accelerometer goes on."""
+    samples, rng = readings(), np.random.default_rng(5)
+    shakes = np.where(np.arange(len(STAMPS)) < 5 * HZ, 2.0, 0.1)[:, None] * step_radps
+    true = 0.02 * step_radps + np.array([1.0, -2.0, 3.0]) * step_radps + shakes * rng.normal(size=(len(STAMPS), 3))
+    samples[:, 3:] = np.round(true / step_radps) * step_radps
+    assert (samples[5 * HZ :, 3:] == samples[-1, 3:]).all(), "5 s of one triple, though nothing is frozen"
+    assert not frozen_samples(STAMPS, samples).any()
+    assert not any(as_it_comes(samples))
+    assert not any(as_it_comes(samples[::-1])), "it stands when it is switched on, too"
+    assert frozen_samples(STAMPS, frozen(samples, 700, 800)).sum() == 100, "frozen in all six axes it is found"
+    assert sum(as_it_comes(frozen(samples, 700, 800))) == 81
+    samples[:, 3:] = true
+    samples[5 * HZ :, 3:] = true[5 * HZ]
+    assert frozen_samples(STAMPS, samples).sum() == 5 * HZ - 1, "unrounded, the rates alone tell"
+
+
 def test_an_imu_that_repeats_from_the_start_is_frozen() -> None:
     samples = np.zeros((len(STAMPS), 6))
     assert frozen_samples(STAMPS, samples).sum() == len(samples) - 1

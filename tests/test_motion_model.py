@@ -185,6 +185,22 @@ def test_offline_the_model_is_taught_where_motion_is_measured() -> None:
     assert standing[0] == pytest.approx(1.0 + guess * 10.0 / (10.0 + measured_s), rel=0.1)
 
 
+def test_offline_it_is_taught_although_every_measurement_is_rare() -> None:
+    """A car with a fix every 12 s: as if nothing were known of it, it'd be held to 2 m/s. What is longer than usual teaches nothing."""
+    found = where_unaided(range(0, 61, 12))
+    assert found is not None
+    assert found.nodes == frozenset(range(60))
+    standing = found.model.process(np.zeros(2), 1e6)[1]
+    guess, measured_s = 2.0**2, 60.0
+    assert standing[1] == pytest.approx(1.0 + 3.0**2 + (guess - 3.0**2) * 10.0 / (10.0 + measured_s), rel=0.1)
+    lost = where_unaided(range(0, 25, 6))
+    assert lost is not None
+    assert lost.nodes == frozenset(range(24, 60))
+    assert lost.model.process(np.zeros(2), 1e6)[1][0] == pytest.approx(1.0 + guess * 10.0 / (10.0 + 24.0), rel=0.1), (
+        "36 s are six times the usual interval: there the IMU may have drifted"
+    )
+
+
 def test_a_step_is_in_the_graphs_that_have_both_its_states() -> None:
     found = where_unaided(range(31))
     assert found is not None

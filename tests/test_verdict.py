@@ -10,11 +10,12 @@ from graphloc import app
 from graphloc.config import AerialConfig, AprilTagConfig
 from graphloc.eval.calibrate import Calibration, Check, Suggestion
 from graphloc.eval.ekf import FilterResult
+from graphloc.eval.late_check import _late_velocity
 from graphloc.eval.metrics import Antennas, Table
 from graphloc.eval.report import ReportData, Trust, durations_s, stretches, verdict
 from graphloc.eval.report._health import cure, section
 from graphloc.eval.report._sections import _key_numbers
-from graphloc.eval.report._track_verdict import _late_velocity, main_table
+from graphloc.eval.report._track_verdict import main_table
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.judge.health import health_of
 from graphloc.ledger import Ledger, LedgerRow, Outcome

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphloc.chi2 import SIGMAS_95, chi2_95
-from graphloc.config import AerialConfig, GnssConfig, VelocityConfig
 from graphloc.eval.formatting import percent
+from graphloc.eval.late_check import late_doubts
 from graphloc.eval.metrics import Table, errors, held_out_errors, receiver_errors, squared_over_covariance
 from graphloc.eval.report._data import ReportData
 from graphloc.eval.report._health import said_of, shares
@@ -37,7 +37,6 @@ _TOO_SURE = 4.0  # NEES from which bounds are too small: errors are 1.4 times wh
 # Least share of the time in which the online 95 % bounds hold the offline position. Honest bounds do for at least 95 %,
 # as the offline track is better informed.
 _HOLDS_OFFLINE = 0.9
-_PLACES = ("gnss", "pose", "aerial")
 _BESIDE_GNSS, _FEWEST_USED = ("pose", "aerial", "apriltag"), 10
 _GUESS = 0.25  # share of a bound, above which a guess (95 %) makes a part of it that matters; a choice
 # A receiver contradicts the track if half of its fixes are farther away than the larger of these:
@@ -244,51 +243,11 @@ def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
 
 
 def _late(data: ReportData, solution: Solution) -> Iterator[Reason]:
-    """Yield a sentence on each suggested time offset that matters.
-
-    It does if it moves the track (of a position sensor), or turns it (of a velocity), by more than its bounds.
-    """
-    track = solution.trajectory
-    if data.calibration is None or track.cov is None or track.v_world_mps is None:
-        return
-    speed_mps, bound_m = rms(_away(track.v_world_mps)), float(np.median(bounds_95(track.cov)[:, 0]))
-    for found in data.calibration.suggestions:
-        off_s, block = abs(found.suggested - found.configured), data.config.sensors[found.sensor]
-        if isinstance(block, VelocityConfig) and found.unit == "s" and block.stamp_sigma_s == 0.0:
-            yield from _late_velocity(found.sensor, off_s, solution)
-        if isinstance(block, GnssConfig | AerialConfig) and block.stamp_sigma_s > 0.0:
-            taken_s = solution.time_offsets_s.get(found.sensor)
-            if isinstance(block, GnssConfig) or taken_s is None:
-                continue  # the delay is estimated, and the bounds include it
-            off_s = abs(found.suggested - found.configured - taken_s)  # a large delay is estimated only in part
-        if found.unit == "s" and block.kind in _PLACES and off_s * speed_mps > bound_m:
-            yield Reason(
-                trust=Trust.WITH_CARE,
-                text=f"{found.sensor} and the IMU are {off_s:.2g} s apart (Calibration, below): at this run's {speed_mps:.1f} m/s the "
-                f"track is up to {off_s * speed_mps:.2f} m behind or ahead, which its bounds of {bound_m:.2f} m (median) do not include.",
-            )
-
-
-def _late_velocity(sensor: str, off_s: float, solution: Solution) -> Iterator[Reason]:
-    """Yield a sentence on a velocity sensor whose delay `off_s` turns the heading by more than its bounds.
-
-    It turns the heading by as much as the accelerations turn within the delay, on average.
-    """
-    track = solution.trajectory
-    assert track.cov is not None
-    assert track.v_world_mps is not None
-    if len(track.stamps_ns) < 2:
-        return
-    gained = np.gradient(track.v_world_mps[:, :2], track.stamps_ns * 1e-9, axis=0)
-    power = (gained**2).sum(axis=1)
-    turned_deg = abs(float(np.degrees(off_s * (power @ solution.gyro_radps[:, 2]) / max(power.sum(), 1e-9))))
-    bound_deg = float(np.median(bounds_95(track.cov)[:, 2]))
-    if turned_deg > bound_deg:
-        yield Reason(
-            trust=Trust.WITH_CARE,
-            text=f"{sensor} and the IMU are {off_s:.2g} s apart (Calibration, below): as this run turns, the heading is about "
-            f"{turned_deg:.1f} deg off where it comes from the motion, which its bounds of {bound_deg:.1f} deg (median) do not include.",
-        )
+    """Yield the stamps that calibration doubts, where that is not said of the whole run already."""
+    if data.calibration is not None:
+        for why in late_doubts(solution, data.config, data.calibration):
+            if why not in solution.doubts:
+                yield Reason(trust=Trust.WITH_CARE, text=f"{why}.")
 
 
 def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:

@@ -17,6 +17,7 @@ from graphloc.errors import InputError, SolveError
 from graphloc.eval import calibrate, ekf, holdout
 from graphloc.eval.digerud import run_digerud
 from graphloc.eval.gnss_check import GnssOffset, gnss_offsets
+from graphloc.eval.late_check import late_doubts
 from graphloc.eval.mount_check import MountDoubt, mount_doubts
 from graphloc.eval.simulate import SimulatedRun
 from graphloc.eval.tag_check import suspect_tags
@@ -151,14 +152,16 @@ def smooth_recording(
     tags, said = found_tags.about_tags(recording, config, solution)
     mounts, offsets = _track_warnings(solution, recording, config)
     far_off = (offset.doubt for offset in offsets if offset.doubt)
-    for doubt in (*recording.clock_doubts[:1], *(d.seen for d in mounts[:1]), *far_off):
+    calibration = calibrate.calibrate(recording, config, solution)
+    late = late_doubts(solution, config, calibration)
+    for doubt in (*recording.clock_doubts[:1], *(d.seen for d in mounts[:1]), *far_off, *late):
         solution = solution.doubted(doubt)
     said += [*map(str, mounts), *map(str, offsets), *([never] if never else [])]
     run = Run(
         recording=replace(recording, warnings=(*recording.warnings, *said)), config=config, solution=solution,
         held=_when_measured(held, solution),
         filters=filters, online=online, pictures=pictures, tags=tags,
-        calibration=calibrate.calibrate(recording, config, solution),
+        calibration=calibration,
     )  # fmt: skip
     return made_comparable(_with_underlay(run, scans))
 

@@ -15,6 +15,9 @@ from graphloc.motion_model import MotionModel, Moving
 from graphloc.timeline import Timeline
 
 _UNAIDED_S = 10.0  # shortest time without such a sensor: for less, the IMU alone is far better than the model
+# Times the usual interval of such measurements, up to which the motion between two is known well enough to learn from: where
+# all come more rarely than every 10 s, nothing would be learned else, and a guess would hold the craft.
+_LEARNED = 3.0
 Span = tuple[int, int]
 
 
@@ -56,17 +59,28 @@ def usual_motion(
         holes: gaps of the IMU, across which the rotation is unknown, and with it the body axes that the model is about.
     """
     ends = np.concatenate([timeline.stamps_ns[:1], aided_ns, timeline.stamps_ns[-1:]])
-    long = np.flatnonzero(np.diff(ends) > _UNAIDED_S * 1e9)
-    if not len(long):
+    unaided = _intervals(ends, _UNAIDED_S * 1e9)
+    if not unaided:
         return None
-    spans = list(zip(ends[long].tolist(), ends[long + 1].tolist(), strict=True))
+    usual_ns = float(np.median(np.diff(aided_ns))) if len(aided_ns) > 1 else 0.0
+    unknown = _intervals(ends, max(_UNAIDED_S * 1e9, _LEARNED * usual_ns))
     model, nodes = MotionModel(remembered_s=np.inf), set()
     node_ns = timeline.slow_stamps_ns
     for j in range(len(node_ns) - 1):
         here_ns, next_ns = int(node_ns[j]), int(node_ns[j + 1])
-        if not any(a <= here_ns and next_ns <= b for a, b in spans):
+        if not _within(unknown, here_ns, next_ns):
             moving = Moving.of(values, int(np.searchsorted(timeline.slow_of, j)))
             model.learn(here_ns, (moving.R.T @ moving.v_mps)[:2])
-        elif not any(a < next_ns and b > here_ns for a, b in holes):
+        if _within(unaided, here_ns, next_ns) and not any(a < next_ns and b > here_ns for a, b in holes):
             nodes.add(j)
     return UsualMotion(model, frozenset(nodes))
+
+
+def _intervals(ends: NDArray[np.int64], longer_ns: float) -> list[Span]:
+    """Return the intervals between successive stamps that are longer than some time."""
+    long = np.flatnonzero(np.diff(ends) > longer_ns)
+    return list(zip(ends[long].tolist(), ends[long + 1].tolist(), strict=True))
+
+
+def _within(spans: Sequence[Span], begin_ns: int, end_ns: int) -> bool:
+    return any(a <= begin_ns and end_ns <= b for a, b in spans)

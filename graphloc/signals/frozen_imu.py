@@ -3,7 +3,8 @@
 
 Such samples claim standstill or a steady turn, whatever the vessel does. Real noise never repeats bit for bit in all
 six axes for long, nor in the three rates for a second. A simulated IMU without noise does repeat at rest, but then its
-rates are exactly zero, and such samples are accepted.
+rates are exactly zero, and such samples are accepted. Nor are rates judged by themselves where they come in steps that are
+coarser than noise, rounded to two digits by a driver: at rest they repeat for minutes.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ than they measure, and quantised readings at rest, repeat for less."""
 RATES_LEAST_S, RATES_FEWEST = 1.0, 50
 """Duration (s) and number of repetitions from which repeated rates alone count as frozen: three axes repeat by chance
 more easily than six."""
+_COARSE_RADPS = float(np.radians(0.1))
+"""Smallest change of a rate, above which it counts as coarse: a choice, between the steps of MEMS gyroscopes (2000 deg/s in 16 bits:
+0.06 deg/s), which their noise exceeds, and those of '%.1f' deg/s or '%.2f' rad/s (0.57 deg/s)."""
 FROZEN_IMU = "frozen: it repeats one sample (or its three rates) bit for bit while the stamps advance; check the sensor and its driver"
 
 
@@ -34,9 +38,16 @@ def frozen_samples(stamps_ns: NDArray[np.int64], samples: Array) -> NDArray[np.b
         stamps_ns: (N,), increasing. samples: (N, 6), specific force (m/s^2) and angular rate (rad/s), axes of the IMU.
     """
     rates = samples[:, 3:]
-    return _repeats(stamps_ns, samples, ~_at_rest(samples), LEAST_S, FEWEST) | _repeats(
-        stamps_ns, rates, (rates != 0.0).any(axis=1), RATES_LEAST_S, RATES_FEWEST
-    )
+    frozen = _repeats(stamps_ns, samples, ~_at_rest(samples), LEAST_S, FEWEST)
+    if _step_radps(rates) > _COARSE_RADPS:
+        return frozen
+    return frozen | _repeats(stamps_ns, rates, (rates != 0.0).any(axis=1), RATES_LEAST_S, RATES_FEWEST)
+
+
+def _step_radps(rates: Array) -> float:
+    """Return the smallest change of an axis from one of some rates (N, 3) to the next; inf if none changes."""
+    changes = np.abs(np.diff(rates, axis=0))
+    return float(changes[changes > 0.0].min(initial=np.inf))
 
 
 def _repeats(
@@ -85,10 +96,15 @@ def _at_rest(samples: Array) -> NDArray[np.bool_]:
 
 
 class FrozenImuDetector:
-    """Online counterpart of `frozen_samples`: repetitions are accepted until the stretch is long enough."""
+    """Online counterpart of `frozen_samples`: repetitions are accepted until the stretch is long enough.
+
+    Rates count as coarse until they have once changed by less.
+    """
 
     def __init__(self) -> None:
         self._all, self._rates = _Stretch(LEAST_S, FEWEST), _Stretch(RATES_LEAST_S, RATES_FEWEST)
+        self._before: Array | None = None
+        self._step_radps = np.inf  # smallest change of a rate so far
         self.frozen = False
         """Whether the newest sample is a repetition of a frozen IMU."""
 
@@ -96,7 +112,11 @@ class FrozenImuDetector:
         """Take in a sample; return whether it is a repetition of a frozen IMU."""
         row = np.concatenate([m.accel_mps2, m.gyro_radps])
         by_all = self._all.goes_on(m.stamp_ns, row) and not bool(_at_rest(row))
+        if self._step_radps > _COARSE_RADPS and self._before is not None:
+            self._step_radps = min(self._step_radps, _step_radps(np.stack([self._before, m.gyro_radps])))
+        self._before = m.gyro_radps
         by_rates = self._rates.goes_on(m.stamp_ns, m.gyro_radps) and bool(m.gyro_radps.any())
+        by_rates = by_rates and self._step_radps <= _COARSE_RADPS
         self.frozen = by_all or by_rates
         return self.frozen
 
