@@ -55,6 +55,7 @@ _AT_ONCE, _AFTER_GAP = 0.1, 1.3  # in median steps: the largest within a burst, 
 _BURSTS = 0.3  # least share of samples in bursts from which bursts are laid out evenly
 _HOLE = 0.7  # in periods of the IMU: a sample is missing if both neighbours are farther away, as online
 _BEFORE_S = 1.0  # late samples may be so much older than the first one in order
+_PACE_OF, _STEADIER = 21, 0.5  # samples of which the median latency is taken; share of the spread that is left
 _IN_ORDER = 0.8  # least share, in order, of the samples after a clock was set back: others come late
 
 
@@ -307,6 +308,57 @@ def recorder_set(stamps_ns: Stamps, logs_ns: Stamps) -> ClockStep | None:
         return None
     k = int(np.argmax(np.abs(by_ns)))
     return ClockStep(float(by_ns[k]) / NS_PER_S, int(logs_ns[k + 1]))
+
+
+class RecordingPace(NamedTuple):
+    """How recording times run beside the stamps of the headers: recording times (K,) and latencies (K,) there, ns."""
+
+    logs_ns: Stamps
+    late_ns: Stamps
+
+    def of_stamps(self, logs_ns: Stamps) -> Stamps:
+        """Return recording times (N,) at the pace of the stamps, so that messages are as late as at the beginning."""
+        grown = np.interp(logs_ns - self.logs_ns[0], self.logs_ns - self.logs_ns[0], self.late_ns - self.late_ns[0])
+        return np.asarray(logs_ns - np.rint(grown).astype(np.int64))
+
+    @property
+    def said(self) -> str:
+        """The pace in words."""
+        took_s, grown_s = (float(of[-1] - of[0]) / NS_PER_S for of in (self.logs_ns, self.late_ns))
+        return (
+            f"recording took {took_s:.0f} s while the stamps of the headers went on by {took_s - grown_s:.0f} s, as of a simulator, or of a bag "
+            "that was played at another speed or with pauses: the stamps are taken"
+        )
+
+
+def pace(imu: tuple[Stamps, Stamps], others: Iterable[tuple[Stamps, Stamps]]) -> RecordingPace | None:
+    """Return the pace of the recording times if it is not that of the stamps of most topics, else None.
+
+    Clocks are compared by usual latencies, which mean nothing if all latencies grow. The IMU's clock alone may be
+    wrong: so most other topics must get steadier by its latencies.
+
+    Args:
+        imu, others: stamps and recording times (N,) of topics with stamps.
+    """
+    stamps_ns, logs_ns = imu
+    if len(stamps_ns) < FEWEST_STAMPS or set_backs(stamps_ns):
+        return None
+    late_ns, limit_ns = steady_logs(stamps_ns, logs_ns) - stamps_ns, duration_ns(EPOCH_LIMIT_S)
+    if _spread(late_ns) <= limit_ns:
+        return None
+    from scipy.ndimage import median_filter  # seldom needed, and slow to load
+
+    found = RecordingPace(logs_ns, np.asarray(median_filter(late_ns, _PACE_OF, mode="nearest")))
+    spreads = [
+        (_spread(logs - stamps), _spread(found.of_stamps(logs) - stamps)) for stamps, logs in others if len(stamps)
+    ]
+    steadier = [left < _STEADIER * own for own, left in spreads if max(own, left) > limit_ns]
+    return found if 2 * sum(steadier) > len(steadier) else None
+
+
+def _spread(latency_ns: Stamps) -> float:
+    """Return the range of most latencies (N,), ns."""
+    return float(np.subtract(*np.percentile(latency_ns, [95.0, 5.0])))
 
 
 def _unusual(latency_ns: Stamps) -> NDArray[np.bool_]:

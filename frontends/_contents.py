@@ -16,6 +16,7 @@ from graphloc.frontends._clock import (
     GAIN_LIMIT_S,
     ClockStep,
     leaps,
+    pace,
     recorder_set,
     refuse_woven,
     steady_logs,
@@ -125,11 +126,25 @@ def _imu_of(streams: Sequence[TopicData]) -> TopicData | None:
 
 
 def _steadily_recorded(streams: list[TopicData]) -> tuple[list[TopicData], list[str]]:
-    """Return the streams with recording times as if the recorder's clock had not been set, and a warning if it was."""
+    """Return the streams with recording times at the pace of the stamps, and as if the recorder's clock had not been set.
+
+    With a warning if they were not.
+    """
+    streams, said = _at_pace(streams)
     recorder = next((at for s in streams if (at := recorder_set(s.stamps_ns, s.logs_ns))), None)
     if recorder is None:
+        return streams, said
+    return [s.logged(steady_logs(s.stamps_ns, s.logs_ns)) for s in streams], [*said, recorder.said_of_recorder]
+
+
+def _at_pace(streams: list[TopicData]) -> tuple[list[TopicData], list[str]]:
+    """Return the streams with recording times at the pace of the stamps, as when the bag is read, and a warning."""
+    imu = _imu_of(streams)
+    stamped = [(s.stamps_ns, s.logs_ns) for s in streams if s.stamped_by_header and s is not imu]
+    found = pace((imu.stamps_ns, imu.logs_ns), stamped) if imu and imu.stamped_by_header else None
+    if found is None:
         return streams, []
-    return [s.logged(steady_logs(s.stamps_ns, s.logs_ns)) for s in streams], [recorder.said_of_recorder]
+    return [s.logged(found.of_stamps(s.logs_ns)) for s in streams], [found.said]
 
 
 def _without_leaps(streams: list[TopicData]) -> tuple[list[TopicData], list[str]]:

@@ -94,8 +94,10 @@ def _odometry_blocks(inspection: Inspection) -> Iterator[list[str]]:
     speeds = [item for item in odometry if item.role == "check_speed"]
     for item in speeds:
         if item.fused:
-            said = "not fused, as it has used receiver and IMU already; truth_topic if it is better than they are"
-            yield [f"# {item.topic}: {said}; {item.why}"]
+            better = (
+                f"no truth_topic: {item.world}" if item.origin is None else "truth_topic if it is better than they are"
+            )
+            yield [f"# {item.topic}: not fused, as it has used receiver and IMU already; {better}; {item.why}"]
     for k, item in enumerate(item for item in speeds if not item.fused):
         yield wheels_block(numbered("wheels", k), item)
     alone = not inspection.gnss and not inspection.in_a_grid

@@ -77,6 +77,14 @@ class Readings:
         """Return the recording times as an array."""
         return np.array(self.logs_ns, dtype=np.int64)
 
+    def restamp(self, stamps_ns: NDArray[np.int64]) -> None:
+        """Set other stamps (N,), in place."""
+        self.stamps_ns[:] = stamps_ns.tolist()
+        self.values[:] = [
+            replace(v, stamp_ns=n) if isinstance(v, Measurement) else v
+            for v, n in zip(self.values, self.stamps_ns, strict=True)
+        ]
+
     def of(self, kind: type[_Kind]) -> list[_Kind]:
         """Return the values of a class, in order."""
         return [v for v in self.values if isinstance(v, kind)]
@@ -109,6 +117,22 @@ class Readings:
         )
 
 
+def at_pace(sensors: Sequence[Readings], warnings: list[str]) -> None:
+    """Take recording times, in place, to the pace of the stamps, where most topics say that it is another."""
+    imu = next((r for r in sensors if r.config.kind == "imu" and r.stamps_ns), None)
+    stamped = [r for r in sensors if r.stamps_ns and r.stamps_ns != r.logs_ns]
+    others = ((r.stamps(), r.logs()) for r in stamped if r is not imu)
+    pace = _clock.pace((imu.stamps(), imu.logs()), others) if imu and imu in stamped else None
+    if pace is None:
+        return
+    warnings.append(pace.said)
+    for r in sensors:
+        logs_ns = pace.of_stamps(r.logs())
+        if r not in stamped:
+            r.restamp(logs_ns)
+        r.logs_ns[:] = logs_ns.tolist()
+
+
 def right_leaps(sensors: Sequence[Readings], warnings: list[str]) -> None:
     """Correct the stamps, in place, of sensors whose clock was set by whole seconds.
 
@@ -123,11 +147,7 @@ def right_leaps(sensors: Sequence[Readings], warnings: list[str]) -> None:
         stamps_ns, said = _clock.without_leaps(r.stamps(), logs_ns, latency_s, r.sensor)
         if said:
             warnings.append(said)
-            r.stamps_ns[:] = stamps_ns.tolist()
-            r.values[:] = [
-                replace(v, stamp_ns=n) if isinstance(v, Measurement) else v
-                for v, n in zip(r.values, r.stamps_ns, strict=True)
-            ]
+            r.restamp(stamps_ns)
 
 
 def reject_jumps(sensors: Sequence[Readings], warnings: list[str]) -> list[LedgerRow]:

@@ -278,8 +278,14 @@ class TopicData:
         return replace(self, _stamps=[stamp_ns + by_ns for stamp_ns in self._stamps])
 
     def logged(self, logs_ns: NDArray[np.int64]) -> TopicData:
-        """Return the stream with other recording times (N,)."""
-        return replace(self, _logs=logs_ns.tolist())
+        """Return the stream with other recording times (N,), its stamps where headers hold none."""
+        logs = logs_ns.tolist()
+        return replace(self, _logs=logs, _stamps=self._stamps if self.stamped_by_header else logs)
+
+    @property
+    def stamped_by_header(self) -> bool:
+        """Whether the stamps are not the recording times."""
+        return self._stamps != self._logs
 
     def stamped(self, stamps_ns: NDArray[np.int64]) -> TopicData:
         """Return the stream with other stamps (N,)."""

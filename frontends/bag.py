@@ -34,6 +34,7 @@ from graphloc.frontends._mount_yaw import yaw_in_craft
 from graphloc.frontends._reader import Reader, either
 from graphloc.frontends._readings import (
     Readings,
+    at_pace,
     imu_series,
     judge_fixes,
     reject_far,
@@ -108,6 +109,7 @@ def read_recording(bags: Bags | Bag, config: VesselConfig, progress: Progress | 
         scan_latencies = _scan_latencies(bag, config)
         warnings = list(bag.warnings)
 
+    at_pace(sensors, warnings)
     right_leaps(sensors, warnings)
     rows += reject_jumps(sensors, warnings)
     rows += reject_far_poses(sensors, warnings)

@@ -326,6 +326,31 @@ def test_online_a_guess_goes_on_where_the_motion_contradicts_it(monkeypatch: pyt
 
 
 @pytest.mark.usefixtures("short_wait")
+def test_online_a_guess_that_the_motion_contradicts_starts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A boat that had drifted for minutes, and then went home at 3 m/s, kept a heading that was 80 deg off, and was 13 m off.
+
+    The motion tells the error to 17 deg: more than a guess, if less than is asked of a heading that sensors measure.
+    """
+    near: list[float] = []
+
+    def tried(setup: Any, imu: Any, reached: Any, datum: Any, near_rad: float | None) -> Any:
+        near.extend([] if near_rad is None else [near_rad])
+        return online_start.try_start(setup, imu, reached, datum, near_rad)
+
+    monkeypatch.setattr(HeadingCheck, "_fit", lambda *_of, **_how: Fit(complex(np.exp(-1.5j)), 0.3))
+    monkeypatch.setattr(_smoother, "try_start", tried)
+    monkeypatch.setattr(_heading_check, "_KNOWN_DEG", 360.0)  # the window takes its heading for known after minutes
+    recording, config, _, _ = robot(3, 34.0, speed_mps=8.0)
+    solved = app.replay_recording(recording, config).solution
+    assert any("the motion tells the heading, which was a guess: restarts" in line for line in solved.stats.events)
+    when_s = solved.trajectory.stamps_ns * 1e-9
+    yaws = [
+        np.arctan2(R[1, 0], R[0, 0]) for R in solved.trajectory.R_world_body[np.diff(when_s, append=when_s[-1]) < 1.0]
+    ]
+    assert np.abs(wrap_angle(near[0] + 1.5 - np.array(yaws))).min() < 0.1  # less the error of the heading that it had
+
+
+@pytest.mark.usefixtures("short_wait")
 @pytest.mark.parametrize(("since_s", "every_s", "most_deg"), [(20.0, 1.0, 10.0), (17.0, 4.0, 20.0)])
 def test_online_a_compass_that_comes_later_ends_a_guess(since_s: float, every_s: float, most_deg: float) -> None:
     """A guess that is wrong by 130 deg: in its bounds until the compass has been there for 5 s and three headings, then right.

@@ -386,8 +386,22 @@ def test_a_compass_far_off_its_mount_is_reported() -> None:
         app.simulated(simulate_slowly(replace(scenario, compass_offset_deg=deg), 2, 1.25)).solution.stats.warnings
         for deg in (8.0, 0.0)
     )
-    assert any(w.startswith("compass: its compass offset is estimated") for w in off)
+    assert any(w.startswith("compass: its compass offset is estimated") and "check its mount" in w for w in off)
     assert not any("compass offset" in w for w in right)
+
+
+def test_a_compass_in_iron_is_not_said_to_be_turned() -> None:
+    """Its deviation was told as an offset, to be looked for in mounts."""
+    run = simulate_slowly(replace(BASE, gnss_sigma_m=0.02, duration_s=80.0, gnss_hz=5.0, compass_hz=5.0), 2, 1.25)
+    deviates = tuple(
+        replace(m, yaw_rad=m.yaw_rad + np.radians(8.0) * np.sin(m.yaw_rad)) if isinstance(m, CompassHeading) else m
+        for m in run.recording.measurements
+    )
+    found = app.smooth_recording(replace(run.recording, measurements=deviates), run.config).solution.stats.warnings
+    (said,) = [w for w in found if "compass offset" in w]
+    assert "(C " in said
+    assert "raise deviation_sigma_deg" in said
+    assert "mount" not in said
 
 
 def test_the_deviation_of_a_compass_is_told_by_the_motion() -> None:

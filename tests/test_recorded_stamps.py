@@ -261,6 +261,37 @@ def test_clocks_that_are_set_together_are_one(tmp_path: Path) -> None:
     assert not any("was set" in w for w in (*seen.warnings, *read(tmp_path, config).warnings))
 
 
+@pytest.mark.parametrize(
+    "recorded_s", [lambda s: 2.0 * s, lambda s: 0.5 * s, lambda s: s + 20.0 * (s > 15.0)], ids=["slow", "fast", "pause"]
+)
+def test_what_a_slow_simulator_says_is_read_by_its_stamps(tmp_path: Path, recorded_s: Callable[[float], float]) -> None:
+    """Fixes that end early had another usual latency than the IMU: their clock was said to be off by seconds."""
+    asked = [item for item in restamped({}) if item[0] != "/fix" or item[1] < START_NS + 25 * S]
+    items = [(name, START_NS + round(1e9 * recorded_s((at_ns - START_NS) / S)), m) for name, at_ns, m in asked]
+    for k, (name, at_ns, m) in enumerate(items):
+        if name == "/compass":
+            yaw = np.degrees(2.0 * np.arctan2(m.quaternion.z, m.quaternion.w))
+            items[k] = ("/heading", at_ns, MAKE.t["std_msgs/msg/Float64"](data=float(90.0 - yaw) % 360.0))
+    found, config, text = look(tmp_path, items, MAKE)
+    assert "time_offset_s" not in text
+    assert "clock_drift_ppm" not in text
+    recording = read(tmp_path, config)
+    for warnings in (found.warnings, recording.warnings):
+        assert [w[:14] for w in warnings if "recording took" in w or "clock" in w] == ["recording took"]
+    stamps = {
+        kind: [m.stamp_ns for m in recording.measurements if isinstance(m, kind)]
+        for kind in (GnssPosition, CompassHeading)
+    }
+    assert stamps[GnssPosition] == [at_ns - WAY_NS["/fix"] for name, at_ns, _ in asked if name == "/fix"]
+    measured = np.array([at_ns - WAY_NS["/compass"] for name, at_ns, _ in asked if name == "/compass"])
+    assert np.abs(np.array(stamps[CompassHeading]) - measured).max() < 0.2 * S  # no stamp of its own
+
+
+def test_a_clock_of_an_imu_that_runs_slow_is_not_the_recorders(tmp_path: Path) -> None:
+    _, config, _ = look(tmp_path, restamped({"/imu": lambda ns: ns - (ns - START_NS) // 20}), MAKE)
+    assert not any("recording took" in w for w in read(tmp_path, config).warnings)
+
+
 def test_a_clock_that_is_set_is_not_said_to_drift_because_that_of_the_imu_does(tmp_path: Path) -> None:
     """A drift that was that of the IMU with its sign turned was proposed."""
     change = {"/fix": lambda ns: ns + S // 2 * (ns > START_NS + 30 * S), "/imu": lambda ns: ns + (ns - START_NS) // 50}

@@ -112,6 +112,10 @@ class HeadingCheck:
         self._right = self._fits = 0
         self.within_rad = np.inf
 
+    def put_right(self) -> None:
+        """Forget that the heading was wrong: the estimate started anew with the one that the motion tells."""
+        self.said, self.off_rad, self._wrong = "", 0.0, 0
+
     @property
     def doubtful(self) -> bool:
         """Whether the last check found the heading wrong."""
@@ -152,7 +156,7 @@ class HeadingCheck:
         # The estimated bias is not taken off: a wrong heading bends it until it fits.
         fit = self._fit(lag, newest, fixes, np.zeros(3), any_place=guessed)
         self.within_rad = _within_rad(fit)
-        found = _off(fit)
+        found = _off(fit, guessed=guessed)
         if found is None:
             self._wrong = 0
             return False
@@ -164,7 +168,7 @@ class HeadingCheck:
                 (drift, False),
                 *(((np.zeros(3), True), (drift, True)) if _may_be_late(lag, fixes[-1].sensor) else ()),
             ):
-                told = _off(self._fit(lag, newest, fixes, by, late=late))
+                told = _off(self._fit(lag, newest, fixes, by, late=late), guessed=guessed)
                 if told is not None and not _turned(*told):
                     found = told
                     break
@@ -334,11 +338,17 @@ def _lever_m(lag: Lag, receiver: str) -> Array:
     return _mount_m(lag, receiver) + lag.antennas_off_m().get(receiver, np.zeros(3))
 
 
-def _off(fit: Fit | None) -> tuple[float, float] | None:
-    """Return the error of the heading and its sigma (rad); None where the motion does not show it well."""
-    if fit is None or not _SIZE[0] < abs(fit.rho) < _SIZE[1] or fit.sigma > _SURE:
+def _off(fit: Fit | None, *, guessed: bool) -> tuple[float, float] | None:
+    """Return the error of the heading and its sigma (rad); None where the motion does not show it well.
+
+    Args:
+        guessed: whether the heading is a guess: then what tells more than the guess is enough.
+    """
+    if fit is None or not _SIZE[0] < abs(fit.rho) < _SIZE[1]:
         return None
-    return -float(np.angle(fit.rho)), fit.sigma
+    if fit.sigma > (abs(fit.rho) / _LIKELY if guessed else _SURE):
+        return None
+    return -float(np.angle(fit.rho)), fit.sigma / abs(fit.rho) if guessed else fit.sigma
 
 
 def _within_rad(fit: Fit | None) -> float:

@@ -461,17 +461,19 @@ class OnlineSmoother:
         """
         if known is None or not known.doubt(now_ns):
             return None
-        heading = self._persistent.heading
-        told = heading is None or not heading.doubt(now_ns)
+        heading, check = self._persistent.heading, self._persistent.heading_check
+        told = heading is None or not heading.doubt(now_ns) or check.said != ""
         if not told and not tracking.heading_measured():
             return None
         again_s = LEAST_S * (2**self._denied if told else 1)
         if heading is None or now_ns - self._tried_ns >= duration_ns(again_s):
             self._tried_ns = now_ns
-            came, near_rad = tracking.told_by() if told else (tracking.since(tracking.lag.first_ns), None)
+            came, near_rad = tracking.told_by(check.off_rad) if told else (tracking.since(tracking.lag.first_ns), None)
             samples = [m for m in came if isinstance(m, ImuSample)]
             started = self._start_from(samples, [m for m in came if not isinstance(m, ImuSample)], now_ns, near_rad)
-            if not isinstance(started, str) and not started.heading:
+            # A guess that fits the motion is better than one that does not.
+            if not isinstance(started, str) and (check.said or not started.heading):
+                check.put_right()
                 why = "the motion tells" if told else "sensors measure"
                 return f"{why} the heading, which was a guess", started, came
             self._denied += told

@@ -318,10 +318,11 @@ class Tracking:
         again = (m for m in self._recent if m.stamp_ns >= stamp_ns and not self._ledger.has(m))
         return sorted(again, key=lambda m: m.stamp_ns)
 
-    def told_by(self) -> tuple[list[Measurement], float]:
+    def told_by(self, off_rad: float = 0.0) -> tuple[list[Measurement], float]:
         """Return the data by which the motion has told a heading, by stamp, and about the yaw (rad) at their first.
 
-        The yaw is that of the newest state, carried back by the gyroscope, whose bias is not removed. Data whose ledger
+        The yaw is that of the newest state, less the error that the motion tells of it (`off_rad`), carried back by the
+        gyroscope, whose bias is not removed. Data whose ledger
         row is written, or will be with the window, get arrival number -1.
         """
         lag = self.lag
@@ -334,7 +335,7 @@ class Tracking:
         R = lag.newest.pose.rotation().matrix()
         samples = [m for m in came if isinstance(m, ImuSample) and m.stamp_ns <= lag.newest.stamp_ns]
         rates = np.array([m.gyro_radps for m in samples]).reshape(-1, 3) @ lag.problem.R_body_imu.T @ R[2]
-        return came, float(yaw_from_rotation(R)) - float(np.trapezoid(rates, stamps_of(samples) * 1e-9))
+        return came, float(yaw_from_rotation(R)) - off_rad - float(np.trapezoid(rates, stamps_of(samples) * 1e-9))
 
     def trajectory(self, now: Estimate) -> Trajectory:
         """Return the states of the window, and `now` if it is newer; all get the covariance of `now`.

@@ -57,6 +57,8 @@ def _far_from_prior(stream: Stream, result: BatchResult) -> tuple[float, str]:
     k = int(np.argmax(far))
     where = f"{slow.axes[k]} {value[k] * slow.scale[k]:.3g} {slow.units[k]}"
     cure = "check its mount and the IMU's, or raise the configured sigma"
+    if slow.axes[k] in slow.no_tails:
+        cure = "it varies with the heading, as by iron near a magnetic compass: raise deviation_sigma_deg"
     if slow.axes[k] == "scale":
         times = 1.0 + float(value[k])
         wrong = "check its unit and calibration, or raise scale_sigma"
