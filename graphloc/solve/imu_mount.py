@@ -7,6 +7,7 @@ dx + c m = b, with
 
     c = J_imu U,   U: m in the attitude of every state
 
+and the rows of velocities that are predicted with what it measures (`_swung_by_turn`).
 What no change of the states explains, c~ = c - J argmin |J X - c|, carries the information on m:
 
     (c~'c~ + 1 / s^2) m = c~'b - t / s^2,   s: sigmas of the mount, t: by which it is turned already
@@ -28,11 +29,12 @@ import gtsam
 import numpy as np
 
 from graphloc import keys
-from graphloc.build import Problem, StartPrior, with_imu_turned
+from graphloc.build import Problem, StartPrior, Stream, solved_constants, with_imu_turned
 from graphloc.errors import SolveError
 from graphloc.frames import Array, skew
+from graphloc.graph import TIME_OFFSET, antenna_off_m, corrections
 from graphloc.judge.decide import Stage, Verdicts, weigh
-from graphloc.judge.linearised import linearised, normal_solver, sparse_rows, with_left_out
+from graphloc.judge.linearised import Rows, linearised, normal_solver, sparse_rows, with_left_out
 from graphloc.recording import Progress
 from graphloc.solve._passes import Settled, cost_of_run, settle
 
@@ -94,11 +96,17 @@ def mount_error(
     if not sigma.any():
         return None
     n = len(problem.timeline)
-    told = follows = _followed(*sparse_rows(graph, values), n)
+
+    def followed(problem: Problem, values: gtsam.Values) -> _Followed:
+        rows = linearised(problem, values, verdicts, prior)
+        root, J, b = rows.weighed()
+        return _followed(J, b, n, root[:, None] * _swung_by_turn(problem, rows, values, verdicts))
+
+    swung = any(_measures_velocity(stream) for stream in problem.streams)
+    told = follows = followed(problem, values) if swung else _followed(*sparse_rows(graph, values), n, np.zeros(3))
     if any(stream.left_out is not None for stream in problem.streams):
         # The graph takes the drift of these for motion, which would speak for a turned mount as if it were true.
-        _, J, b = linearised(*with_left_out(problem, values), verdicts, prior).weighed()
-        told = _followed(J, b, n)
+        told = followed(*with_left_out(problem, values))
     # In sigmas of the mount, because those of some axes may be 0.
     left = told.left * sigma
     unit = np.linalg.inv(left.T @ left + np.eye(3))
@@ -148,11 +156,43 @@ class _Followed(NamedTuple):
     b: Array
 
 
-def _followed(J: Any, b: Array, n: int) -> _Followed:
-    """Return how a linear system J (rows, columns), b (rows,) of n states follows the turn of the IMU's mount."""
-    c = by_turn(J, n)
+def _followed(J: Any, b: Array, n: int, swung: Array) -> _Followed:
+    """Return how a linear system J (rows, columns), b (rows,) of n states follows the turn of the IMU's mount.
+
+    Args:
+        swung: (rows, 3) as of `_swung_by_turn`, weighted as J.
+    """
+    c = by_turn(J, n) + swung
     X = -normal_solver(J)(J.T @ c)
     return _Followed(X, c + J @ X, b)
+
+
+def _measures_velocity(stream: Stream) -> bool:
+    return stream.row.company and not stream.row.absolute
+
+
+def _swung_by_turn(problem: Problem, rows: Rows, values: gtsam.Values, verdicts: Verdicts) -> Array:
+    """Return the part (rows, 3) of c in the rows of velocities.
+
+    The velocity of an antenna or log at l is predicted from that of the body with what the IMU measures, R (w x l), and
+    if it is late, with R (f + w' x l + w x (w x l)); w, w' and f turn with the mount. Without that, these rows would
+    hold the heading of the body.
+    """
+    c = np.zeros((len(rows.b), 3))
+    for stream in filter(_measures_velocity, problem.streams):
+        corrected, used = corrections(solved_constants(stream, values), stream.mount), rows.used(stream)
+        off_m, late_s = antenna_off_m(corrected), corrected.get(TIME_OFFSET, 0.0)
+        shift = np.zeros((len(used), 9, 3))
+        for by, i in zip(shift, used, strict=True):
+            at = verdicts[stream.number, i].at
+            arm, w = skew(at.lever_m if off_m is None else at.lever_m + off_m), skew(at.gyro_radps)
+            turned = arm @ w
+            if late_s and (felt := at.felt) is not None:
+                swing = skew(-arm @ at.gyro_radps) @ w + w @ arm @ w
+                turned += late_s * (arm @ skew(felt.spin_radps2) + swing - skew(felt.force_mps2))
+            by[6:] = at.T_world_body.rotation().matrix() @ turned
+        c += rows.moved(stream, used, shift)
+    return c
 
 
 def by_turn(J: Any, n: int) -> Array:
