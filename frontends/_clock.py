@@ -344,6 +344,8 @@ def pace(imu: tuple[Stamps, Stamps], others: Iterable[tuple[Stamps, Stamps]]) ->
     if len(stamps_ns) < FEWEST_STAMPS or set_backs(stamps_ns):
         return None
     late_ns, limit_ns = steady_logs(stamps_ns, logs_ns) - stamps_ns, duration_ns(EPOCH_LIMIT_S)
+    if np.diff(stamps_ns).min() < -limit_ns:  # single recording times are wrong, by which messages are in order
+        return None
     if _spread(late_ns) <= limit_ns:
         return None
     from scipy.ndimage import median_filter  # seldom needed, and slow to load

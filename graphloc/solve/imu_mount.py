@@ -182,6 +182,8 @@ def _swung_by_turn(problem: Problem, rows: Rows, values: gtsam.Values, verdicts:
     for stream in filter(_measures_velocity, problem.streams):
         corrected, used = corrections(solved_constants(stream, values), stream.mount), rows.used(stream)
         off_m, late_s = antenna_off_m(corrected), corrected.get(TIME_OFFSET, 0.0)
+        if not used:
+            continue
         shift = np.zeros((len(used), 9, 3))
         for by, i in zip(shift, used, strict=True):
             at = verdicts[stream.number, i].at
