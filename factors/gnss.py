@@ -82,7 +82,7 @@ def _by_constants(at: Attachment, config: GnssConfig) -> tuple[Array, ...]:
     columns = [at.sensor_velocity_mps(off)[:, None]] if config.stamp_sigma_s > 0.0 else []
     if config.mount_sigma_m > 0.0:
         turn = at.T_state_sensor.rotation().matrix()
-        columns.append(at.T_world_body.rotation().matrix() @ (turn + late * skew(at.gyro_radps) @ turn))
+        columns.append(at.R_by_constants @ (turn + late * skew(at.gyro_radps) @ turn))
     return (np.hstack(columns),) if columns else ()
 
 

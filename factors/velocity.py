@@ -59,7 +59,7 @@ def _by_constants(at: Attachment, config: VelocityConfig, to_local: Array) -> tu
         swing = skew(at.gyro_radps)
         if late and at.felt is not None:
             swing = swing + late * (skew(at.felt.spin_radps2) + swing @ swing)
-        columns.append(at.T_world_body.rotation().matrix() @ swing @ at.T_state_sensor.rotation().matrix())
+        columns.append(at.R_by_constants @ swing @ at.T_state_sensor.rotation().matrix())
     return (to_local @ np.hstack(columns),) if columns else ()
 
 

@@ -68,6 +68,8 @@ class Attachment:
         v_world_mps: (3,) its estimated velocity, world axes.
         T_solver: pose (gtsam.Pose3) about which the solver linearises, where it keeps older linearisations (see `graphloc.linear`);
             None: `T_world_body`, because all factors are written anew at every pass.
+        R_first: attitude (3, 3), body to world, at which derivatives by constants are taken, where the solver keeps older linearisations
+            (see `online._constants`); None: that of `T_world_body`.
         T_state_sensor: axes and lever arm of the sensor at the measurement's stamp, axes of the body at the state (gtsam.Pose3).
         carried_m: (3,) way of the body from the state to the measurement, world axes, as estimated.
         dv_world_mps: (3,) velocity at the measurement less that at the state, world axes.
@@ -103,6 +105,7 @@ class Attachment:
     slow_walk: Array | None = None
     constants: tuple[tuple[int, Array], ...] = ()
     T_solver: Any | None = None
+    R_first: Array | None = None
     felt: FeltMotion | None = None
     own: tuple[tuple[int, ...], ...] = ()
 
@@ -120,6 +123,11 @@ class Attachment:
             return 0.0
         walk = np.diag(self.slow_walk)
         return walk if shown is None else np.asarray(shown @ walk @ shown.T)
+
+    @property
+    def R_by_constants(self) -> Array:
+        """Attitude (3, 3), body to world, at which derivatives by constants are taken."""
+        return self.T_world_body.rotation().matrix() if self.R_first is None else self.R_first
 
     @property
     def body_m(self) -> Array:

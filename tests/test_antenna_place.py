@@ -294,13 +294,13 @@ def test_a_compass_that_was_set_as_told_is_not_corrected_twice(tmp_path: Path) -
     assert np.abs(yaw_errors_deg(right, resumed)).max() < 5.0
 
 
-def test_the_report_says_that_online_bounds_are_too_small_before_a_turn() -> None:
+def test_the_report_says_what_online_bounds_include_of_an_estimated_place() -> None:
     run = displaced(1.0)
     found = solved(run)
     online = replace(found.solution, stats=replace(found.solution.stats, online=True))
     data = app.report_data(replace(found, recording=replace(run.recording, truth=None), online=online))
     offline_said, online_said = (
-        [reason.trust for reason in track.reasons if "the bounds of the online track are too small" in reason.text]
+        [reason.trust for reason in track.reasons if "the bounds of the online track include to first order" in reason.text]
         for track in verdict(data).tracks
     )
     assert (offline_said, online_said) == ([], [Trust.WITH_CARE])

@@ -270,8 +270,8 @@ def _levers(data: ReportData, solution: Solution) -> Iterator[Reason]:
         else:
             yield Reason(
                 trust=Trust.WITH_CARE,
-                text=f"Where the antenna of {name} sits is estimated (mount_sigma_m): while the vessel has hardly turned, the bounds of the "
-                "online track are too small for that. Measured, they are right.",
+                text=f"Where the antenna of {name} sits is estimated (mount_sigma_m), which the bounds of the online track include to first order "
+                "only. Measured, they are narrower.",
             )
 
 

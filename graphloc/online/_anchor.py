@@ -68,6 +68,8 @@ class Anchor:
             solution.
         slow: slow states, by sensor. constants: by sensor and number. level: levelling factor of a start; None: there
             is none, as in a snapshot.
+        turned_rad: angle about the vertical from the attitude of `pose` to that at which the Gaussian takes derivatives by
+            constants (see `Constants.turned_rad`).
     """
 
     stamp_ns: int
@@ -79,6 +81,7 @@ class Anchor:
     slow: Mapping[str, ConditionalGaussian] = field(default_factory=dict)
     constants: Mapping[tuple[str, int], ConditionalGaussian] = field(default_factory=dict)
     level: Level | None = None
+    turned_rad: float = 0.0
 
     @classmethod
     def of_start(cls, stamp_ns: int, prior: StartPrior) -> Anchor:
@@ -231,6 +234,7 @@ class Anchor:
             "bias": self.bias.tolist(),
             "step": self.step.tolist(),
             "cov": self.cov.tolist(),
+            "turned_rad": self.turned_rad,
             "slow": {name: _plain(b) for name, b in self.slow.items()},
             "constants": [[name, k, _plain(b)] for (name, k), b in self.constants.items()],
         }
@@ -250,6 +254,7 @@ class Anchor:
             bias=_array(raw["bias"], (6,)),
             step=_array(raw["step"], (_CORE,)),
             cov=_array(raw["cov"], (_CORE, _CORE)),
+            turned_rad=float(_array(raw["turned_rad"], ())),
             slow={str(name): _read(b) for name, b in raw["slow"].items()},
             constants={(str(name), int(k)): _read(b) for name, k, b in raw["constants"]},
         )

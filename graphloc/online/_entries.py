@@ -168,6 +168,8 @@ class Entries:
         window, timeline = self._window, self._problem.timeline
         t = timeline.page_s(timeline.stamps_ns[entry.state])
         at = replace(verdict.at, T_solver=window.linearised_at(verdict.at.pose_key))
+        if stream.constants:
+            at = replace(at, R_first=self._constants.first_attitude(at.T_world_body))
         update = factors_of(stream.row, m, stream.config, at, verdict.decision)
         for key, value in update.guesses:
             if not window.values.exists(key):

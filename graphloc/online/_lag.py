@@ -111,6 +111,7 @@ class Lag:
             window.relinearise()
             self._entries.follow_solver()
             self._constants.revise()
+            self._constants.hold_turn()
         self._constants.remember(now_s)
         before = window.values.atPose3(pose).translation()
         window.commit()

@@ -19,7 +19,7 @@ from graphloc.online._anchor import Anchor
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import ErrorSizes
 
-_VERSION = 11
+_VERSION = 12
 _EVERY_S = 2.0  # lost where the process is killed: short beside the 20 s for which an IMU gap is bridged; a choice
 _MOST_TIMES = 1e4  # factor on a data sheet's noise that no sensor exceeds, not even an IMU on an engine
 
