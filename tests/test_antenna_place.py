@@ -300,7 +300,11 @@ def test_the_report_says_what_online_bounds_include_of_an_estimated_place() -> N
     online = replace(found.solution, stats=replace(found.solution.stats, online=True))
     data = app.report_data(replace(found, recording=replace(run.recording, truth=None), online=online))
     offline_said, online_said = (
-        [reason.trust for reason in track.reasons if "the bounds of the online track include to first order" in reason.text]
+        [
+            reason.trust
+            for reason in track.reasons
+            if "the bounds of the online track include to first order" in reason.text
+        ]
         for track in verdict(data).tracks
     )
     assert (offline_said, online_said) == ([], [Trust.WITH_CARE])

@@ -70,4 +70,6 @@ def test_a_window_that_begins_anew_keeps_the_first_attitude() -> None:
     assert Anchor.from_dict(anchor.as_dict()).turned_rad == anchor.turned_rad
     lag = tracking._built(replace(anchor, turned_rad=0.2), tracking._recent.samples())  # noqa: SLF001
     first = lag._constants.first_attitude(anchor.pose)  # noqa: SLF001
+    around = tracking._built(replace(anchor, turned_rad=2.0), tracking._recent.samples())  # noqa: SLF001
+    assert around._constants.turned_rad == 0.0  # noqa: SLF001 - the heading was wrong: steps would go the wrong way
     np.testing.assert_allclose(first, gtsam.Rot3.Rz(0.2).matrix() @ anchor.pose.rotation().matrix(), atol=1e-4)

@@ -13,6 +13,7 @@ drives straight (first-estimates Jacobian: Huang, Mourikis & Roumeliotis 2010; D
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -30,6 +31,7 @@ from graphloc.online._anchor import Anchor, ConditionalGaussian
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._window import Held, Window
 
+_ASTRAY_RAD = 0.7  # a step is then 0.8 of what it should be, and 0.6 of it goes aside; a choice
 _CHANGED = 0.05  # relative change of a prior's sigma from which the prior is replaced
 
 Number = tuple[str, int]
@@ -79,9 +81,13 @@ class Constants:
 
     @property
     def turned_rad(self) -> float:
-        """Angle about the vertical from the estimated attitudes to those at which derivatives by constants are taken."""
+        """Angle about the vertical from the estimated attitudes to those at which derivatives by constants are taken.
+
+        0 after a correction by so much that steps along these would lead the constants astray.
+        """
         first = self._problem.timeline.first
-        return self._first_yaw_rad[first] - self._yaw_rad(first)
+        turned_rad = math.remainder(self._first_yaw_rad[first] - self._yaw_rad(first), math.tau)
+        return turned_rad if abs(turned_rad) < _ASTRAY_RAD else 0.0
 
     def _yaw_rad(self, k: int) -> float:
         return float(self._window.values.atPose3(keys.pose(k)).rotation().yaw())
