@@ -250,6 +250,17 @@ def test_stamps_that_are_too_old_for_any_use_are_said_to_be_of_another_clock(lat
     assert [(e.text.split(":")[0], e.warns) for e in said] == [("gnss", True)]
 
 
+@pytest.mark.parametrize(("late_s", "good"), [(-18, False), (15, True)], ids=["GPS time", "too old for any use"])
+def test_no_pose_is_good_by_measurements_of_the_future(late_s: int, good: bool) -> None:
+    """A compass that is 18 s ahead turns the vessel 18 s later. One that is 15 s behind is not used at all."""
+    base, online = arrivals_of(run_of()), smoother(run_of())
+    came = base[: at_s(base, 20.0)]
+    put = [replace(a.m, stamp_ns=a.m.stamp_ns - late_s * 10**9) if a.m.sensor == "compass" else a.m for a in came]
+    last = [found for m in put if (found := online.feed(m)) is not None][-1]
+    assert (str(last.health) == "good") is good
+    assert ("the stamps of compass are of a clock ahead of the IMU's" in str(last.reason)) is not good
+
+
 def test_a_dead_imu_is_said_once_a_silence() -> None:
     """The newest pose stays as it is, good or not, so nothing else would show it."""
     online, _ = begun(10.0)

@@ -36,6 +36,11 @@ def why_late(sensor: str) -> str:
     return f"the stamps of {sensor} are far off what stamp_sigma_s allows for"
 
 
+def why_ahead(sensor: str) -> str:
+    """Return the reason why no pose is good beside a sensor whose stamps are of a clock ahead of the IMU's."""
+    return f"the stamps of {sensor} are of a clock ahead of the IMU's"
+
+
 def why_unlikely(sensor: str) -> str:
     """Return the reason why no pose is good beside a sensor that agrees only by an unlikely large slow error."""
     return f"{sensor} agrees only by more than {FAR_OFF:g} sigmas of its slow error: it contradicts the others"

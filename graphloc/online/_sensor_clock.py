@@ -55,10 +55,12 @@ class SensorClock:
 
     Attributes:
         set_ns: by how much the clock has been set so far; it is subtracted from each stamp.
+        ahead: whether the stamps are far ahead of the IMU's, so that all measurements are used at wrong times. (Stamps far behind
+            are too late for any use.)
     """
 
     def __init__(self) -> None:
-        self.set_ns = 0
+        self.set_ns, self.ahead = 0, False
         self._ahead_ns: deque[int] = deque(maxlen=_REMEMBERED)  # stamps less that of the newest IMU sample at arrival
         self._apart_ns: deque[int] = deque(maxlen=_REMEMBERED)  # time between arrivals, by the IMU's stamps
         self._imu_ns = 0  # stamp of the newest IMU sample at the last arrival
@@ -122,20 +124,19 @@ class SensorClock:
         """Return a line for users, once, if all stamps are ahead of the IMU's, or far behind, while the IMU goes on; else empty."""
         least_s, most_s = min(self._ahead_ns) / NS_PER_S, max(self._ahead_ns) / NS_PER_S
         caught_up_s, goes_on = (self._ahead_ns[-1] - self._ahead_ns[0]) / NS_PER_S, median(self._apart_ns) > 0
-        if (
-            self._said
-            or len(self._ahead_ns) < _FEWEST
-            or not (least_s >= _FUTURE_S or (most_s <= -lag_s and caught_up_s < _STEADILY_S))
-            or not goes_on
-        ):
+        off = least_s >= _FUTURE_S or (most_s <= -lag_s and caught_up_s < _STEADILY_S)
+        found = len(self._ahead_ns) >= _FEWEST and off and goes_on
+        self.ahead = found and least_s > 0.0
+        if self._said or not found:
             return ""
         self._said = True
-        off = f"{least_s:.1f} s ahead of" if least_s > 0.0 else f"{-most_s:.1f} s behind"
-        return f"{sensor}: its stamps are {off} the IMU's: of another clock? (time_offset_s)"
+        by = f"{least_s:.1f} s ahead of" if least_s > 0.0 else f"{-most_s:.1f} s behind"
+        return f"{sensor}: its stamps are {by} the IMU's: of another clock? (time_offset_s)"
 
     def _begin_anew(self) -> list[Measurement]:
         self._ahead_ns.clear()
         self._apart_ns.clear()
+        self.ahead = False
         return self.left()
 
     def _decide(self) -> PutRight:

@@ -16,6 +16,7 @@ import numpy as np
 from graphloc.errors import SolveError, in_one_line
 from graphloc.estimate import Estimate, Event
 from graphloc.frames import Array, yaw_from_rotation
+from graphloc.judge.health import why_ahead
 from graphloc.judge.wrong_imu import WRONG_IMU
 from graphloc.ledger import Outcome
 from graphloc.measurements import ImuSample, ImuSeries, Measurement
@@ -290,7 +291,8 @@ class Tracking:
         heading = persistent.heading
         guess, heading_var = (heading.doubt(now.stamp_ns), heading.var(now.stamp_ns)) if heading else ("", 0.0)
         wrong = f"{self._setup.imu_name} {WRONG_IMU}" if self._doubt.leaves_out(now.stamp_ns) else ""
-        doubts = (persistent.heading_check.said, guess, lag.in_doubt(now.stamp_ns), wrong)
+        clocks = [why_ahead(name) for name, clock in persistent.clocks.items() if clock.ahead]
+        doubts = (persistent.heading_check.said, guess, lag.in_doubt(now.stamp_ns), wrong, *clocks)
         return estimate_of(
             now,
             lag,
