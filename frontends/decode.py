@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 from scipy.spatial.transform import Rotation
 
@@ -32,6 +32,7 @@ from graphloc.errors import ConfigError
 from graphloc.extras import added
 from graphloc.frames import Array, Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.frontends import nmea
+from graphloc.frontends._crs import check_metric, warn_of_loose_tie
 from graphloc.frontends._fixes import RTK_SIGMA_M
 from graphloc.frontends._rejections import Rejection, ignored, malformed, rejected
 from graphloc.frontends._said import (
@@ -243,9 +244,13 @@ def _place_nmea(msg: Any, config: GnssConfig) -> SaidPlace | Rejection:
 @lru_cache(maxsize=8)
 def _from_grid(grid: str) -> Transformer:
     try:
-        return Transformer.from_crs(grid, 4326, always_xy=True)
+        crs = CRS.from_user_input(grid)
     except CRSError:
         raise ValueError(f"grid {grid} is not known") from None
+    check_metric(f"grid {grid}", crs)
+    found = Transformer.from_crs(crs, 4326, always_xy=True)
+    warn_of_loose_tie(f"grid {grid}", crs, found.accuracy)
+    return found
 
 
 def _place_grid(msg: Any, config: GnssConfig) -> SaidPlace | Rejection:

@@ -25,12 +25,12 @@ from rasterio.enums import ColorInterp, Resampling
 
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
+from graphloc.frontends._crs import warn_of_loose_tie
 from graphloc.frontends.aerial.tiles import describe_tiles
 
 Pixels = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 _NET_M = 8.0
-_LOOSE_M = 1.5  # a tie to WGS 84 with a larger uncertainty is warned of; ties of ETRS 89 state 1 m
 _SAMPLES, _SAMPLE_PX = 8, 128
 _WKT_CHARS = 100_000
 _PALETTE_PX = 300_000_000  # most pixels that are read at once of an image with a palette, which cannot be read coarser
@@ -242,8 +242,7 @@ def _tie(path: Path, wkt: str, datum: Datum) -> Any:
         raise InputError(
             f"{path}: its CRS ({crs.name}) is tied to no place on Earth: gdal_translate -a_srs EPSG:<code>"
         )
-    if ties[0].accuracy > _LOOSE_M:
-        log.warning("%s: its CRS (%s) is tied to WGS 84 to %g m only", path, crs.name, ties[0].accuracy)
+    warn_of_loose_tie(f"{path}: its CRS", crs, ties[0].accuracy)
     return ties[0]
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 import warnings
 
 import numpy as np
@@ -12,13 +11,11 @@ from pyproj.exceptions import ProjError
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
 from graphloc.frames import Array, Datum
+from graphloc.frontends._crs import check_metric, warn_of_loose_tie
 from graphloc.survey import WORLD, Survey
 
 _AHEAD_M = 10.0  # distance over which the direction of grid north is computed
 _FAR_M = 50e3  # farther from the datum, the zone is wrong, or northing and easting are swapped
-_LOOSE_M = 1.5  # a tie to WGS 84 with a larger uncertainty is warned of; ties of ETRS 89 state 1 m
-
-log = logging.getLogger(__name__)
 
 
 def in_world(survey: Survey, datum: Datum) -> Survey:
@@ -67,17 +64,16 @@ class _Grid:
                 ties = TransformerGroup(crs, 4326, always_xy=True, area_of_interest=here).transformers
         except ProjError:
             raise ValueError(f"grid {name} is not known") from None
-        axes = {(axis.direction, axis.unit_name) for axis in crs.axis_info[:2]}
-        if not ties or not crs.is_projected or axes != {("east", "metre"), ("north", "metre")}:
-            raise ValueError(f"grid {name} ({crs.name}) does not count metres east and north")
+        check_metric(f"grid {name}", crs)
+        if not ties:
+            raise ValueError(f"grid {name} ({crs.name}) is tied to no place on Earth")
         if crs.is_compound:  # its heights are above sea level
             flat = crs.sub_crs_list[0].name
             raise ValueError(
                 f"grid {name} ({crs.name}) has heights of its own: name that of {flat} alone, and give heights above the ellipsoid"
             )
         self._to_geodetic = ties[0]
-        if self._to_geodetic.accuracy > _LOOSE_M:
-            log.warning("grid %s (%s) is tied to WGS 84 to %g m only", name, crs.name, self._to_geodetic.accuracy)
+        warn_of_loose_tie(f"grid {name}", crs, self._to_geodetic.accuracy)
         self._name, self._datum = name, datum
 
     def placed(self, what: str, xyz_m: tuple[float, float, float]) -> tuple[tuple[float, float, float], float]:

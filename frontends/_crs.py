@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What map grids and images share of coordinate reference systems: their axes, and how well they are tied to WGS 84."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+_LOOSE_M = 1.5  # a tie to WGS 84 with a larger uncertainty is warned of; ties of ETRS 89 state 1 m
+
+log = logging.getLogger(__name__)
+
+
+def check_metric(what: str, crs: Any) -> None:
+    """Check that a CRS (pyproj) counts metres east and north.
+
+    Raises:
+        ValueError: it counts other units, or angles.
+    """
+    axes = {(axis.direction, axis.unit_name) for axis in crs.axis_info[:2]}
+    if not crs.is_projected or axes != {("east", "metre"), ("north", "metre")}:
+        raise ValueError(f"{what} ({crs.name}) does not count metres east and north")
+
+
+def warn_of_loose_tie(what: str, crs: Any, accuracy_m: float) -> None:
+    """Warn where a CRS (pyproj) is tied to WGS 84 loosely, or by nothing that PROJ knows.
+
+    Args:
+        accuracy_m: of the tie, as PROJ states it; negative: it knows none, and takes its datum for WGS 84.
+    """
+    if accuracy_m > _LOOSE_M:
+        log.warning("%s (%s) is tied to WGS 84 to %g m only", what, crs.name, accuracy_m)
+    elif accuracy_m < 0.0:
+        log.warning(
+            "%s (%s): nothing ties its datum to WGS 84, it may lie 100 m and more off: name it by its EPSG code", what, crs.name
+        )  # fmt: skip
