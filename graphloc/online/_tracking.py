@@ -324,8 +324,8 @@ class Tracking:
         """Return the data by which the motion has told a heading, by stamp, and about the yaw (rad) at their first.
 
         The yaw is that of the newest state, less the error that the motion tells of it (`off_rad`), carried back by the
-        gyroscope, whose bias is not removed. Data whose ledger
-        row is written, or will be with the window, get arrival number -1.
+        gyroscope, whose bias is not removed. Data whose ledger row is written, or will be with the window, get arrival
+        number -1.
         """
         lag = self.lag
         since_ns = min(lag.newest.stamp_ns - duration_ns(_TOLD_S), lag.first_ns)

@@ -40,7 +40,8 @@ def solve_parts(
     """Cut the recording at IMU gaps longer than `bridge_s`, and long parts into legs; solve these and join them.
 
     Args:
-        heading: at the start of the recording, where known; the vessel may have turned in a gap. leg_s: about how long legs are at most. absolute: names of the sensors that measure position.
+        heading: at the start of the recording, where known; the vessel may have turned in a gap.
+        leg_s: about how long legs are at most. absolute: names of the sensors that measure position.
 
     Raises:
         SolveError: no part could be solved; the error of the first one.
