@@ -184,7 +184,7 @@ def turned_as_its_heading(imu: ImuReport, compasses: Sequence[CompassReport]) ->
     if own is None or imu.mount.yaw_told:
         return imu
     R = rotation_from_rpy_deg(np.array(imu.mount.rpy_deg))
-    x_deg = float(np.degrees(np.arctan2(R[1, 0], R[0, 0])))
+    x_deg = 0.0 if own.mount else float(np.degrees(np.arctan2(R[1, 0], R[0, 0])))
     quarters = round(((180.0 if own.backwards else 0.0) - x_deg) / 90.0) % 4
     if quarters == 0:
         return imu
