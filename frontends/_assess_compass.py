@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from graphloc.frames import Array, wrap_angle
-from graphloc.frontends._assess import Courses, one_way, sane
+from graphloc.frames import Array, rotation_from_rpy_deg, wrap_angle
+from graphloc.frontends._assess import Courses, attitudes, one_way, sane
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends._reports import CompassReport, two_antennas
+from graphloc.frontends._reports import CompassReport, MountGuess, two_antennas
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends.decode import IMU, MOST_TURNS, NUMBERS, QUATERNION, yaw_of_x_axis
 from graphloc.frontends.turning import Turning, against_turning, follows_turning
@@ -33,6 +34,7 @@ _SIDEWAYS_DEG = 45.0  # scatter up to which courses still tell by which quarter 
 # Of a vessel that goes ahead and astern: least share of the courses either way; largest share of courses at which it
 # changes between them; share from which the way that it mostly goes is ahead, even if the heading says astern.
 _EITHER_WAY, _OFTEN, _MOST = 0.15, 0.1, 0.6
+_LEVEL_DEG = 3.0  # tilt of an x axis up to which a roll of 10 deg changes its yaw by no more than half a degree
 _RELATIVE_DEG = 30.0  # offset from the course, from which the orientation of an IMU has a north of its own
 
 
@@ -82,6 +84,34 @@ def compass_report(stream: TopicData, courses: Courses | None, turning: Turning 
     judged = fit.good or known.by_gyro is None
     follows = not judged and follows_turning(turning, stamps_ns, in_enu(angle, fit.convention))
     return _by_courses(report, known, fit, heard, follows=follows)
+
+
+def mounted(stream: TopicData, mount: MountGuess) -> TopicData | None:
+    """Return an IMU's orientations turned into the axes of the body; None where that changes no yaw, or is not meant.
+
+    Where the mount tilts the sensor's x axis by p, a roll of the craft by r turns that axis by r tan(p), and not the craft.
+    Some drivers say the orientation of the craft, whatever the axes of their samples: it is level without the mount.
+
+    Args:
+        mount: of the IMU of this topic.
+    """
+    R = rotation_from_rpy_deg(np.array(mount.rpy_deg))
+    if stream.msgtype != IMU or abs(R[2, 0]) < np.sin(np.radians(_LEVEL_DEG)):
+        return None
+    quaternions = stream.rows[:, 6:10]
+    told = attitudes(quaternions)
+    told[told] = [not isinstance(yaw_of_x_axis(*q), Rejection) for q in quaternions[told].tolist()]
+    if told.sum() < _FEWEST:
+        return None
+    said = Rotation.from_quat(quaternions[told])
+    body = said * Rotation.from_matrix(R.T)
+    if np.median(np.abs(body.as_matrix()[:, 2, 2])) < np.median(np.abs(said.as_matrix()[:, 2, 2])):
+        return None
+    rows = stream.rows.copy()
+    rows[:, 6:10] = 0.0  # no orientation
+    rows[told, 6:10] = body.as_quat()
+    rows.flags.writeable = False
+    return replace(stream, _rows=rows)
 
 
 def _without_courses(report: CompassReport, known: _Conventions, heard: Courses | None) -> CompassReport:

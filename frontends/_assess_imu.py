@@ -86,6 +86,7 @@ def turned_as_headed(
         return report
     rpy = yawed(yaw, rotation_from_rpy_deg(np.array(report.mount.rpy_deg)))
     told = f"{report.mount.evidence}; but from there {said}"
+    sigma = float(np.hypot(report.mount.yaw_sigma_deg, sigma))  # that of a levelled mount, if the craft listed
     return replace(report, mount=replace(report.mount, rpy_deg=rpy, evidence=told, yaw_told=True, yaw_sigma_deg=sigma))
 
 

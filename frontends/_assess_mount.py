@@ -24,6 +24,9 @@ from graphloc.frontends._turns import Yaws
 _TILTED_DEG, _QUARTER_DEG, _OVERRULES = 20.0, 20.0, 0.6
 _SLIGHTLY_DEG = 3.0  # deviation from a multiple of 90 deg from which it is said
 _ASKEW_DEG = 15.0  # deviation from which an IMU sits askew: leeway, or an antenna far ahead, make less
+# 1 sigma of the list or trim at which a craft may lie through a recording: as that of a sensor that is drafted in steps
+# of 90 deg though gravity is 7 deg off; a choice.
+_LISTS_DEG = 5.0
 _EITHER = 0.5**0.5  # 1 sigma about one of two angles that are as likely, by how far they are apart
 _AHEAD_DEG = 60.0  # yaw within which an unclear motion says that x is ahead rather than astern or aside
 _CAMERA = -0.7  # z component of y, levelled, below which the axes are a camera's (y down)
@@ -105,13 +108,35 @@ def measured_mount(samples: ImuSamples, motions: Sequence[MeasuredMotion]) -> Mo
         f"gravity is on {name} of the sensor" if aligned else f"gravity is {np.round(axis, 2).tolist()} in the sensor"
     )
     off_deg = float(np.degrees(np.arccos(np.clip(axis @ snapped, -1.0, 1.0))))
-    if not aligned or off_deg < _SLIGHTLY_DEG:
+    if not aligned:
+        return _perhaps_listing(mount_turned(samples, motions, level, said), axis)
+    if off_deg < _SLIGHTLY_DEG:
         return mount_turned(samples, motions, level, said)
     mount = mount_turned(samples, motions, level, f"{said}, {off_deg:.0f} deg off")
     turn = rotation_from_rpy_deg(np.array(mount.rpy_deg)) @ level.T
     roll, pitch, yaw = np.degrees(rpy_from_rotation(turn @ levelling(axis))).tolist()
     square = f"drafted in steps of 90 deg: if the sensor is tilted in the craft, rather than the craft itself, set [{roll:.1f}, {pitch:.1f}, {yaw:.1f}]"
     return replace(mount, evidence=f"{mount.evidence}; {square}", tilt_sigma_deg=off_deg * _EITHER)
+
+
+def _perhaps_listing(mount: MountGuess, axis: Array) -> MountGuess:
+    """Return the mount of a sensor that is levelled by gravity, with the sigmas by a list of the craft meanwhile.
+
+    Gravity does not tell a list from a tilt of the sensor in the craft. Of a sensor that is tilted by p, a list phi about
+    the axis ahead makes the levelled mount wrong by phi about that, and by phi tan(p / 2) about the vertical.
+
+    Args:
+        axis: (3,) unit vector up in the sensor.
+    """
+    cosine = float(-axis[2] if axis[2] < _ON_ITS_HEAD else axis[2])
+    yaw_sigma_deg = _LISTS_DEG * float(np.sqrt((1.0 - cosine) / (1.0 + cosine)))
+    said = f"{mount.evidence}; if the craft listed meanwhile, the mount is as much off"
+    return replace(
+        mount,
+        evidence=said,
+        tilt_sigma_deg=_LISTS_DEG,
+        yaw_sigma_deg=float(np.hypot(mount.yaw_sigma_deg, yaw_sigma_deg)),
+    )
 
 
 def tilt_of(R_body_imu: Array, accel: Array) -> float:
@@ -159,7 +184,7 @@ def turned_as_its_heading(imu: ImuReport, compasses: Sequence[CompassReport]) ->
     if own is None or imu.mount.yaw_told:
         return imu
     R = rotation_from_rpy_deg(np.array(imu.mount.rpy_deg))
-    x_deg = float(np.degrees(np.arctan2(R[1, 0], R[0, 0])))
+    x_deg = 0.0 if own.mount else float(np.degrees(np.arctan2(R[1, 0], R[0, 0])))
     quarters = round(((180.0 if own.backwards else 0.0) - x_deg) / 90.0) % 4
     if quarters == 0:
         return imu

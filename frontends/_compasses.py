@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import Courses, MeasuredMotion
-from graphloc.frontends._assess_compass import compass_report, headings, in_enu, says_the_same
+from graphloc.frontends._assess_compass import compass_report, headings, in_enu, mounted, says_the_same
 from graphloc.frontends._assess_imu import Inertial
 from graphloc.frontends._contents import Contents
 from graphloc.frontends._receivers import Late, receiver_of
@@ -46,19 +46,33 @@ class _Heading(NamedTuple):
 
 
 def compasses_of(
-    bag: Contents, courses: Courses | None, best: Inertial | None, together: Late = _NONE
+    bag: Contents,
+    courses: Courses | None,
+    best: Inertial | None,
+    imus: Sequence[ImuReport],
+    together: Late = _NONE,
 ) -> tuple[CompassReport, ...]:
     """Report every orientation that may be a heading, in the order of `_without_echoes`.
 
     Args:
         bag: what was read. courses: of the fixes; None without fixes. best: the best IMU; None without an IMU.
+        imus: their reports, with the mounts of those that say an orientation.
         together: how late fixes are, by receiver, for headings of the same messages.
     """
     turning = None if best is None else best.felt.turning
-    candidates = bag.of_type(QUATERNION, IMU, *NUMBERS)
+    mounts = {imu.topic: imu.mount for imu in imus}
+    turned = {}
+    candidates = []
+    for stream in bag.of_type(QUATERNION, IMU, *NUMBERS):
+        mount = mounts.get(stream.topic)
+        in_body = mounted(stream, mount) if mount else None
+        if in_body is not None:
+            turned[stream.topic] = mount
+        candidates.append(in_body or stream)
     timed = (_timed(s, courses, turning, together.get(receiver_of(s.topic))) for s in candidates)
     found = _without_echoes([heading for heading in timed if heading])
-    return tuple(_beside_gyro(heading, best) if best else heading.report for heading in found)
+    reports = (_beside_gyro(heading, best) if best else heading.report for heading in found)
+    return tuple(replace(report, mount=turned.get(report.topic)) for report in reports)
 
 
 def _timed(
@@ -154,7 +168,7 @@ def with_own_north(compass: CompassReport, imus: Sequence[ImuReport]) -> Compass
     own = next((imu for imu in imus if imu.topic == compass.topic), None)
     if own is None or not compass.usable or compass.offset_deg is None or compass.two_antennas:
         return compass
-    x_deg = own.mount.rpy_deg[2] if own.mount.yaw_told else 0.0
+    x_deg = own.mount.rpy_deg[2] if own.mount.yaw_told and compass.mount is None else 0.0
     off_deg = compass.offset_deg - x_deg
     return replace(compass, drifts=abs(off_deg - 90.0 * round(off_deg / 90.0)) > _OWN_NORTH_DEG)
 

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from graphloc.config import CompassConfig, ImuConfig
+from graphloc.frames import rotation_from_rpy_deg
+from graphloc.frontends._assess_mount import yawed
 from graphloc.frontends._draft_clock import with_clock
 from graphloc.frontends._draft_lines import FILTERED, mount_line, numbered, topic_lines
 from graphloc.frontends._draft_receivers import receiver_blocks
@@ -207,7 +209,7 @@ def _compass_block(name: str, compass: CompassReport, off: str) -> list[str]:
         lines.append(f"  enabled: false  # guess: {off}")
     elif filtered(compass.topic):
         lines.append(f"  # guess: {FILTERED}; enabled: false where it is a reference to compare with")
-    lines += _mount_lines(compass)
+    lines += [*_tilted_line(compass), *_mount_lines(compass)]
     lines += _error_lines(compass)
     if (compass.msgtype == IMU or filtered(compass.topic)) and not compass.two_antennas:
         lines.append("  use_reported_sigma: false  # guess: drivers' orientation covariances are seldom measured")
@@ -236,6 +238,18 @@ def _error_lines(compass: CompassReport) -> list[str]:
     return [*lines, f"  wander_time_constant_s: {_DRIFTS[1]:.0f}  # guess: likewise"] if compass.drifts else lines
 
 
+def _tilted_line(compass: CompassReport) -> list[str]:
+    """Return the mount of an orientation whose x axis is tilted as its IMU is; none of another one."""
+    mount, yaw = compass.mount, compass.turned_deg
+    if mount is None:
+        return []
+    if mount.tf_frame is not None and yaw == 0.0:
+        return [f"  mount: {{tf_frame: {json.dumps(mount.tf_frame)}}}  # as its IMU"]
+    rpy = yawed(yaw, rotation_from_rpy_deg(np.array(mount.rpy_deg)))
+    off = f", turned by {yaw:.0f} deg: constant offset to the GNSS course" if yaw else ""
+    return [f"  mount: {{rpy_deg: [{', '.join(f'{a:.1f}' for a in rpy)}]}}  # guess: as its IMU{off}"]
+
+
 def _mount_lines(compass: CompassReport) -> list[str]:
     """Return the mount of a compass by the GNSS course, and how well the course tells it."""
     if compass.offset_deg is None:
@@ -252,9 +266,10 @@ def _mount_lines(compass: CompassReport) -> list[str]:
         if compass.one_way:
             why = f"{compass.offset_deg:+.0f} deg off the course, one way all along: leeway, a current, declination or the mount"
         astern = ", unless the vessel goes astern most of the time: then 0" if compass.backwards else ""
-        lines.append(
-            f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course{astern}"
-        )
+        if compass.mount is None:
+            lines.append(
+                f"  mount: {{rpy_deg: [0.0, 0.0, {yaw:.1f}]}}  # guess: constant offset to the GNSS course{astern}"
+            )
     if compass.leeway_deg is not None and compass.leeway_deg > sigma:
         sigma, why = compass.leeway_deg, "as far as its offset to the GNSS course wanders: leeway, or the compass"
     if sigma > _COMPASS_SIGMA_DEG:

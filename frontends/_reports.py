@@ -290,6 +290,8 @@ class CompassReport:
             fields are of corrected stamps.
         late_with_fixes: whether `late_s` is by the fixes of the same messages instead of the gyroscope.
         drifts: whether its north is its own, so that it drifts as a gyroscope does.
+        mount: of the IMU of the same topic, if that tilts the x axis of the orientation; then yaw and offset are of the
+            axes that this mount leads to. None of another compass.
     """
 
     topic: str
@@ -309,6 +311,7 @@ class CompassReport:
     late_s: tuple[float, float] | None = None
     late_with_fixes: bool = False
     drifts: bool = False
+    mount: MountGuess | None = None
 
     @property
     def ahead(self) -> bool:

@@ -7,6 +7,7 @@ The solver trusts headings and gyroscope; where they contradict each other it wo
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -35,6 +36,7 @@ SCATTERED = (
 )
 # Tilt: crossover time from gyroscope to accelerometer, longer than a wave; a craft is seldom tilted by more.
 _TILT_S, _UPRIGHT_RAD = 5.0, 0.8
+_TILT_RAD = np.radians(1.0)  # error of the tilt, 1 sigma: turns are felt as tilt; a choice
 WANDERS_DEG = 1.0
 """Least wander of a compass beside the gyroscope that is said, 1 sigma: a smaller one may be the comparison's error."""
 _CELL_S, _WANDER_BLOCK_S, _LONG_BLOCK_S, _LAGS_S, _MINUTE_S = 2.0, 300.0, 60.0, (4.0, 24.0), 60.0
@@ -57,11 +59,11 @@ of Student's t, which says how far the correlation is beyond chance."""
 def turn_warnings(imu: ImuSeries, sensor: str, headings: Sequence[CompassHeading], convention: str) -> list[str]:
     """Return a warning if headings turn against the gyroscope, or deviate from it by far more than they claim.
 
-    The vertical is the median acceleration, so no mount is needed; an IMU without gravity gives no warning.
+    The vertical is the median acceleration, so the IMU needs no mount; an IMU without gravity gives no warning.
 
     Args:
         imu: the samples. sensor: name of the compass.
-        headings: of one compass, converted as configured. convention: the configured one.
+        headings: of one compass, converted as configured, of an axis that is level (`without_tilt`). convention: the configured one.
     """
     against, apart = _compared(imu, _said(headings))
     if against:
@@ -371,16 +373,47 @@ def yaw_rate(t_s: Array, accel_mps2: Array, gyro_radps: Array, up: Array) -> Arr
     x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
     x /= np.linalg.norm(x)
     level = np.column_stack([x, np.cross(z, x), z])
-    p, q, r = (gyro_radps @ level).T
-    f = accel_mps2 @ level
-    # The accelerometer removes what is slow: a bias of the rates, and a mean vertical that is a little askew.
-    roll, pitch = (
-        _joined(t_s, rate, felt)
-        for rate, felt in ((p, np.arctan2(f[:, 1], f[:, 2])), (q, np.arctan2(-f[:, 0], np.hypot(f[:, 1], f[:, 2]))))
-    )
+    _, q, r = (gyro_radps @ level).T
+    roll, pitch = _roll_pitch(t_s, accel_mps2 @ level, gyro_radps @ level)
     if max(float(np.quantile(np.abs(angle), 0.95)) for angle in (roll, pitch)) > _UPRIGHT_RAD:
         return np.asarray(r)  # no upright craft: rates in another unit, or a hand-held camera
     return np.asarray((q * np.sin(roll) + r * np.cos(roll)) / np.cos(pitch))
+
+
+def _roll_pitch(t_s: Array, accel_mps2: Array, gyro_radps: Array) -> tuple[Array, Array]:
+    """Return roll and pitch (N,), rad, of the axes of the samples, of which the third is about upwards.
+
+    The accelerometer removes what is slow: a bias of the rates, and a mean vertical that is a little askew.
+    """
+    f = accel_mps2
+    roll = _joined(t_s, gyro_radps[:, 0], np.arctan2(f[:, 1], f[:, 2]))
+    return roll, _joined(t_s, gyro_radps[:, 1], np.arctan2(-f[:, 0], np.hypot(f[:, 1], f[:, 2])))
+
+
+def without_tilt(
+    imu: ImuSeries, R_body_imu: Array, R_body_compass: Array, headings: Sequence[CompassHeading]
+) -> list[CompassHeading]:
+    """Return headings of the vessel's own x axis instead of a compass's, which roll and pitch may turn by itself.
+
+    Of a compass whose x axis is tilted by p, a roll r turns the heading by r tan(p). Roll and pitch are by the IMU, and
+    what they leave open, as in turns, is added to the sigmas; without gravity, or of no upright craft, the headings are returned as they are.
+    """
+    if not len(imu.stamps_ns) or float(np.linalg.norm(np.median(imu.accel_mps2, axis=0))) < 5.0:  # m/s^2
+        return list(headings)
+    t = (imu.stamps_ns - imu.stamps_ns[0]) / NS_PER_S
+    roll, pitch = _roll_pitch(t, imu.accel_mps2 @ R_body_imu.T, imu.gyro_radps @ R_body_imu.T)
+    if max(float(np.quantile(np.abs(angle), 0.95)) for angle in (roll, pitch)) > _UPRIGHT_RAD:
+        return list(headings)
+    x, y, z = R_body_compass[:, 0]
+    to_port = y * np.cos(roll) - z * np.sin(roll)
+    ahead = x * np.cos(pitch) + np.sin(pitch) * (y * np.sin(roll) + z * np.cos(roll))
+    at = (stamps_of(headings) - imu.stamps_ns[0]) / NS_PER_S
+    beside = np.interp(at, t, np.unwrap(np.arctan2(to_port, ahead)))
+    unsure = _TILT_RAD * abs(z) / max(float(np.hypot(x, y)), 1e-3)
+    return [
+        replace(m, yaw_rad=float(wrap_angle(m.yaw_rad - by)), sigma_rad=float(np.hypot(m.sigma_rad, unsure)))
+        for m, by in zip(headings, beside, strict=True)
+    ]
 
 
 def _joined(t_s: Array, rate: Array, slow: Array) -> Array:

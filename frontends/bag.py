@@ -50,7 +50,15 @@ from graphloc.frontends._readings import (
 from graphloc.frontends._references import Reference, check_speed, true_trajectory
 from graphloc.frontends._sanity import fast_warning, lever_warning
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends._turns import Yaws, pose_turn_warning, refuse_unit, scale_warning, turn_warnings, wander_warning
+from graphloc.frontends._turns import (
+    Yaws,
+    pose_turn_warning,
+    refuse_unit,
+    scale_warning,
+    turn_warnings,
+    wander_warning,
+    without_tilt,
+)
 from graphloc.frontends.decode import (
     DECODERS_GROUP,
     NMEA,
@@ -124,7 +132,9 @@ def read_recording(bags: Bags | Bag, config: VesselConfig, progress: Progress | 
     motions = _motions_of_fixes(sensors)
     if imu is not None:
         warnings += _unit_warnings(imu, sensors)
-        warnings += _turn_warnings(imu, sensors) + _mount_warnings(imu, [*motions.values()], mounts, config)
+        warnings += _turn_warnings(imu, sensors, mounts, config) + _mount_warnings(
+            imu, [*motions.values()], mounts, config
+        )
     warnings += _silent(sensors, rows, topics, config) + _unstamped(sensors, topics) + _heightless(sensors, config)
     warnings += _along_fewer(sensors) + exchanged_warnings(sensors, motions)
     warnings += [
@@ -389,13 +399,16 @@ def _yaw_of(value: Decoded) -> float:
     return value.yaw_rad if isinstance(value, CompassHeading) else float("nan")
 
 
-def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings]) -> list[str]:
+def _turn_warnings(imu: ImuSeries, sensors: Sequence[Readings], mounts: Mounts, config: VesselConfig) -> list[str]:
+    def rotation(name: str) -> Array:
+        return mounts[name][1] if name in mounts else config.sensors[name].mount.R_body_sensor
+
     lines = []
     for readings in sensors:
         if yaws := _yaws_of(readings):
             lines += scale_warning(imu, readings.sensor, yaws)
         if isinstance(readings.config, CompassConfig):
-            headings = readings.of(CompassHeading)
+            headings = without_tilt(imu, rotation(imu.sensor), rotation(readings.sensor), readings.of(CompassHeading))
             lines += turn_warnings(imu, readings.sensor, headings, readings.config.convention)
             lines += wander_warning(imu, readings.sensor, headings, readings.config)
         elif yaws:

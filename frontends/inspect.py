@@ -114,7 +114,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     evidence = ImuEvidence(motions, courses, bag.tree, posed)
     imus, in_body = _in_axes_up(bag, gnss, _imu_reports(bag, evidence))
     best = _best_imu(bag, imus, evidence)
-    compasses = compasses_of(bag, courses, best)
+    compasses = compasses_of(bag, courses, best, imus)
     ranked = _beside_headings(bag, imus, evidence, compasses)
     turned = [turned_as_its_heading(imu, compasses) for imu in ranked]
     if turned and turned[0] is not imus[0]:
@@ -124,7 +124,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     timed = [timed_fixes(report, late, motions, velocities, bag.streams) for report in gnss]
     together = {receiver_of(report.topic): report.late_s for report in timed if report.late_s}
     if any(c.late_s is None and receiver_of(c.topic) in together for c in compasses):
-        compasses = compasses_of(bag, courses, best, together)
+        compasses = compasses_of(bag, courses, best, imus, together)
     reports = [report for _, report in odometry]
     return Inspection(
         source=bag.source,

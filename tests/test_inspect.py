@@ -1025,6 +1025,55 @@ def oriented(driven: list[Item], R_ahead_sensor: Array) -> list[Item]:
     return sorted(items, key=lambda item: item[1])
 
 
+def test_an_imu_far_askew_may_be_a_craft_that_lists(tmp_path: Path) -> None:
+    """Gravity alone tells no list from a tilt: a list of 12 deg made the heading 4 deg off, and its bound was 2."""
+    pitched = Rotation.from_euler("y", -45.0, degrees=True)
+    listing = Rotation.from_euler("x", 12.0, degrees=True)
+    _, config, text = look(tmp_path, drive(Messages(2), (listing * pitched).as_matrix()), Messages(2))
+    imu = config.sensors["imu"]
+    assert isinstance(imu, ImuConfig)
+    off = Rotation.from_matrix(imu.mount.R_body_sensor @ pitched.as_matrix().T).as_euler(
+        "zyx"
+    )  # of the level that craft has
+    roll, pitch, yaw = imu.mount_sigma_rad
+    assert abs(off[2]) < 3.0 * roll
+    assert pitch == roll
+    assert abs(off[0]) < 3.0 * yaw
+    assert yaw >= roll * np.tan(np.radians(22.5))
+    assert "if the craft listed" in text
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0])
+@pytest.mark.parametrize("tilt_deg", [-45.0, -70.0])
+def test_an_orientation_whose_x_axis_is_tilted_has_the_mount_of_its_imu(
+    tilt_deg: float, yaw_deg: float, tmp_path: Path
+) -> None:
+    """A roll r turns an x axis that is tilted by p by r tan(p): with a yaw alone as the mount, headings were 9 deg off."""
+    R = rotation_z(yaw_deg) @ Rotation.from_euler("y", tilt_deg, degrees=True).as_matrix()
+    items = oriented(drive(Messages(2), R, seconds=120), np.eye(3))
+    start_ns, level = items[0][1], {}
+    for _, at, m in (item for item in items if item[0] == "/imu"):
+        q, a, w = m.orientation, m.linear_acceleration, m.angular_velocity
+        level[at] = yaw = Rotation.from_quat([q.x, q.y, q.z, q.w])
+        angle, rate = 0.15 * np.sin((at - start_ns) / S), 0.15 * np.cos((at - start_ns) / S)
+        roll = Rotation.from_rotvec([angle, 0.0, 0.0])
+        a.x, a.y, a.z = R.T @ roll.inv().apply(R @ [a.x, a.y, a.z])
+        w.x, w.y, w.z = R.T @ (np.array([rate, 0.0, 0.0]) + roll.inv().apply(R @ [w.x, w.y, w.z]))
+        q.x, q.y, q.z, q.w = (yaw * roll * Rotation.from_matrix(R)).as_quat().tolist()
+    _, config, _ = look(tmp_path, items, Messages(2))
+    imu, compass = config.sensors["imu"], config.sensors["compass"]
+    np.testing.assert_allclose(imu.mount.R_body_sensor, R, atol=0.02)
+    np.testing.assert_allclose(compass.mount.R_body_sensor, R, atol=0.02)
+    recording = read_recording(tmp_path / "run", config)
+    assert not [line for line in recording.warnings if "headings differ" in line]
+    off = []
+    for m in recording.of(CompassHeading)[::10]:
+        angle = 0.15 * np.sin((m.stamp_ns - start_ns) / S)
+        x = (level[m.stamp_ns] * Rotation.from_rotvec([angle, 0.0, 0.0])).apply(compass.mount.R_body_sensor[:, 0])
+        off.append(np.arctan2(x[1], x[0]) - m.yaw_rad)
+    assert np.degrees(np.abs((np.array(off) + np.pi) % (2.0 * np.pi) - np.pi)).max() < 4.0
+
+
 @pytest.mark.parametrize("turned", [True, False], ids=["half a turn", "a quarter turn"])
 def test_an_imu_that_no_motion_turns_is_turned_as_its_own_heading(turned: bool, tmp_path: Path) -> None:
     """Hand-held, by a gait that hides what turns feel like: taken as ahead, the solved heading was 177 deg off."""

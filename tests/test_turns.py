@@ -276,7 +276,8 @@ def test_a_compass_in_iron_that_looks_like_another_range_is_named(
         for i in at
     ]
     readings: Any = SimpleNamespace(sensor="compass", config=None, values=headings, stamps=lambda: imu.stamps_ns[at])
-    lines = _turn_warnings(imu, [readings])
+    config: Any = None  # of mounts, for which only a compass is asked
+    lines = _turn_warnings(imu, [readings], {}, config)
     assert ["or off by 20 deg or more in iron" in line for line in lines] == [True] * said
 
 
