@@ -8,6 +8,8 @@ from typing import Any
 
 _LOOSE_M = 1.5  # a tie to WGS 84 with a larger uncertainty is warned of; ties of ETRS 89 state 1 m
 
+_ALIKE = ("WGS 84", "GRS 1980")  # ellipsoids of datums that are within a metre or two of WGS 84
+
 log = logging.getLogger(__name__)
 
 
@@ -26,11 +28,12 @@ def warn_of_loose_tie(what: str, crs: Any, accuracy_m: float) -> None:
     """Warn where a CRS (pyproj) is tied to WGS 84 loosely, or by nothing that PROJ knows.
 
     Args:
-        accuracy_m: of the tie, as PROJ states it; negative: it knows none, and takes its datum for WGS 84.
+        accuracy_m: of the tie, as PROJ states it; negative: it knows none, and takes its datum for WGS 84. So it does with some
+            well-known datums, as Norway's EUREF 89 in a WKT; these are not warned of.
     """
     if accuracy_m > _LOOSE_M:
         log.warning("%s (%s) is tied to WGS 84 to %g m only", what, crs.name, accuracy_m)
-    elif accuracy_m < 0.0:
+    elif accuracy_m < 0.0 and crs.datum.name.lower().startswith("unknown") and crs.ellipsoid.name not in _ALIKE:
         log.warning(
             "%s (%s): nothing ties its datum to WGS 84, it may lie 100 m and more off: name it by its EPSG code", what, crs.name
         )  # fmt: skip

@@ -32,7 +32,7 @@ from graphloc.errors import ConfigError
 from graphloc.extras import added
 from graphloc.frames import Array, Geodetic, rpy_from_rotation, wrap_angle
 from graphloc.frontends import nmea
-from graphloc.frontends._crs import check_metric, warn_of_loose_tie
+from graphloc.frontends._crs import check_metric
 from graphloc.frontends._fixes import RTK_SIGMA_M
 from graphloc.frontends._rejections import Rejection, ignored, malformed, rejected
 from graphloc.frontends._said import (
@@ -248,9 +248,7 @@ def _from_grid(grid: str) -> Transformer:
     except CRSError:
         raise ValueError(f"grid {grid} is not known") from None
     check_metric(f"grid {grid}", crs)
-    found = Transformer.from_crs(crs, 4326, always_xy=True)
-    warn_of_loose_tie(f"grid {grid}", crs, found.accuracy)
-    return found
+    return Transformer.from_crs(crs, 4326, always_xy=True)
 
 
 def _place_grid(msg: Any, config: GnssConfig) -> SaidPlace | Rejection:

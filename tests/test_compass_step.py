@@ -36,4 +36,5 @@ def test_heading_stays(online: bool) -> None:
     seen = run.truth.covers(track.stamps_ns) & (track.stamps_ns - begin_ns > 20e9)
     off = wrap_angle(track.yaw_rad[seen] - run.truth.at(track.stamps_ns[seen]).yaw_rad)
     assert np.degrees(np.sqrt(np.mean(off**2))) < 1.5
+    assert track.cov is not None
     assert np.mean(np.abs(off) < 2.58 * np.sqrt(track.cov[seen, 5, 5])) > 0.95
