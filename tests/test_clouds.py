@@ -113,6 +113,19 @@ def test_absolute_times(
     assert not caplog.records
 
 
+@pytest.mark.parametrize(
+    ("name", "told"), [("point_time", True), ("Timestamp", True), ("t_us", True), ("ring", False), ("intensity", False)]
+)
+def test_a_field_that_looks_like_times_but_is_none_known_is_said(
+    name: str, told: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A scan of 0.1 s that is not corrected for motion is off by a metre at 10 m/s."""
+    assert not since_s(message(turn(0.0, 0.1), "f4", name)).any()
+    assert [name in r.getMessage() and "no field of times that is known" in r.getMessage() for r in caplog.records] == [
+        True
+    ] * told
+
+
 @pytest.mark.parametrize("unit_s", [1.0, 1e-3, 1e-6, 1e-9])
 @pytest.mark.parametrize("clock_s", [UNIX * 1e-9 + 37.0, UNIX * 1e-9 - 37.0, 5000.0, 50_000.0, 10.0, 90.0])
 def test_another_clock_gives_differences_alone(unit_s: float, clock_s: float, caplog: pytest.LogCaptureFixture) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,6 +25,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 CLOUDS = (CLOUD, *LIVOX)
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField
 _TIME_FIELDS = ("time", "t", "timestamp", "offset_time", "time_offset", "time_stamp")
+_TIME_LIKE = re.compile(r"time|stamp|(^|_)t(s|_?ns|_?us)?$", re.IGNORECASE)  # what another driver may name them
 _UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 _USUAL_UNIT_S = {"f4": 1.0, "u4": 1e-9}  # since the header: Velodyne's seconds; Ouster's and Livox's nanoseconds
 _LONGEST_S = 1.0  # longest time from header to point: scans come at 1 Hz or faster
@@ -74,6 +76,12 @@ def decode_cloud(msg: Any, stamp_ns: int, lidar: str) -> Cloud:
     keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & ((abs(x) > 1e-3) | (abs(y) > 1e-3) | (abs(z) > 1e-3))
     xyz = np.column_stack([v[keep] for v in (x, y, z)])
     timed = next((n for n in layout.names or () if n in _TIME_FIELDS), None)
+    if timed is None and (unknown := [field.name for field in msg.fields if _TIME_LIKE.search(field.name)]):
+        _warn_once(
+            lidar,
+            f"its points have no field of times that is known ({', '.join(_TIME_FIELDS)}), but {', '.join(unknown)}; all are taken to be "
+            "at the header's stamp",
+        )
     if timed is None or not len(xyz):
         return Cloud(lidar, stamp_ns, xyz, np.full(len(xyz), stamp_ns, dtype=np.int64))
     since_s = _since_header_s(points[timed][keep], stamp_ns, count, lidar)
