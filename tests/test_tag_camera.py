@@ -8,6 +8,7 @@ import pytest
 
 from graphloc.frames import Array
 from graphloc.frontends.tags.camera import CameraModel, camera_of
+from graphloc.frontends.tags.sightings import is_rectified
 from tests.bagfactory import START_NS, Messages
 
 K = (620.0, 0.0, 655.5, 0.0, 610.0, 340.25, 0.0, 0.0, 1.0)
@@ -164,6 +165,22 @@ def test_equidistant_up_to_the_horizon() -> None:
     inside, outside = bent.rays(np.array([(0.86, 0.0), (0.862, 0.0)]))
     assert np.arctan(inside[0]) < 1.291
     assert np.isnan(outside).all()
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/cam/image_rect_color/compressed", True),
+        ("/cam/rect/image_color", True),
+        ("/cam/image_undistorted", True),
+        ("/cam/image_rect/ffmpeg", True),
+        ("/cam/image_raw", False),
+        ("/cam/image_direct", False),
+        ("/image_corrected", False),
+    ],
+)
+def test_a_topic_says_by_its_name_whether_its_images_are_rectified(topic: str, *, rectified: bool) -> None:
+    assert is_rectified(topic) is rectified
 
 
 @pytest.mark.parametrize("rectified", [False, True])

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -31,6 +32,7 @@ from graphloc.survey import TagConfig
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
+_RECTIFIED = {"rect", "rectified", "undistorted", "undistort"}  # as part of a topic's name
 _NO_FOCAL_PX = 1000.0  # focal length that is assumed, for the noise of corners, of lists of poses without a CameraInfo
 _OTHER_SIZE = 0.02  # relative difference from which a tag's size in a list contradicts the survey's
 
@@ -150,8 +152,8 @@ def camera_info_topic(topic: str) -> str:
 
 
 def is_rectified(topic: str) -> bool:
-    """Return whether a topic of images has distortion removed, by its name (`image_rect`, `image_rect_color`)."""
-    return "rect" in topic.removesuffix("/compressed").rsplit("/", 1)[-1]
+    """Return whether a topic of images has distortion removed, by its name (`image_rect_color`, `rect/image`, `image_undistorted`)."""
+    return not _RECTIFIED.isdisjoint(re.split(r"[/_]", topic.lower()))
 
 
 def _lens(bag: Bag, name: str, config: CameraConfig, listed: bool, warn: Callable[[str], None]) -> CameraModel | None:
