@@ -169,8 +169,13 @@ def _why_unused(stream: TopicData) -> str:
     if stream.msgtype in FIX_TYPES:
         fix = rows[:, 3] >= 0
         beyond = int((fix & (np.abs(rows[:, 0]) > 90.0)).sum())
+        placed = rows[~fix, :2]
+        moves = bool(
+            len(placed) > 1 and np.isfinite(placed).all() and placed.all() and np.ptp(placed, axis=0).min() > 0.0
+        )
+        though = ", though their places change: if the driver leaves the status out, `min_status: any` uses them"
         counts |= {
-            "say 'no fix'": int((~fix).sum()),
+            f"say 'no fix'{though if moves else ''}": int((~fix).sum()),
             "have a latitude beyond 90 deg": beyond,
             "lie at 0, 0, are NaN or beyond 180 deg": int(fix.sum()) - beyond,
         }

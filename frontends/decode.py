@@ -82,7 +82,7 @@ UNSTAMPED = (*NUMBERS, _STRING)
 TF = "tf2_msgs/msg/TFMessage"
 NO_STAMP = "`stamps: recorded` of that sensor takes the recording time instead"
 
-_MIN_STATUS = {"fix": 0, "sbas": 1, "gbas": 2}
+_MIN_STATUS = {"any": -2, "fix": 0, "sbas": 1, "gbas": 2}
 _STATUS_UNKNOWN = -2
 _NO_FIX = "no fix (STATUS_NO_FIX)"
 _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
@@ -490,7 +490,7 @@ def _inertial(said: SaidInertial, config: ImuConfig) -> ImuReading | Rejection:
 
 def _fix(said: SaidPlace, config: GnssConfig, of: Mapping[str, Any]) -> Decoded:
     lat, lon, height = said[:3]
-    if said.status < 0:
+    if said.status < 0 and config.min_status != "any":
         return rejected(_NO_FIX)
     if said.status < _MIN_STATUS[config.min_status]:
         return rejected(f"fix status {said.status} is below min_status '{config.min_status}'")

@@ -75,6 +75,9 @@ def test_fix_without_usable_covariance(covariance: Any, kind: int, expected: lis
 def test_fixes_that_are_none() -> None:
     refused(MAKE.fix(T, status=-1), GnssConfig(), Outcome.REJECTED, "STATUS_NO_FIX")
     refused(MAKE.fix(T, status=0), GnssConfig(min_status="sbas"), Outcome.REJECTED, "min_status")
+    used = decode(MAKE.fix(T, status=-1), GnssConfig(min_status="any"))
+    assert used.position == decode(MAKE.fix(T), GnssConfig()).position
+    refused(MAKE.fix(T, lat=0, lon=0, status=-1), GnssConfig(min_status="any"), Outcome.REJECTED, "0, 0")
     refused(MAKE.fix(T, lat=0, lon=0), GnssConfig(), Outcome.REJECTED, "0, 0")
     refused(MAKE.fix(T, height=np.inf), GnssConfig(), Outcome.MALFORMED, "height is beyond")
     refused(MAKE.fix(T, lon=np.nan), GnssConfig(), Outcome.MALFORMED, "longitude is NaN")

@@ -943,6 +943,22 @@ def test_topics_that_give_nothing_are_reported(status: int, lat: float, said: st
     assert "nothing of its 20 messages" in render(found)
 
 
+@pytest.mark.parametrize(
+    ("step", "said"), [(1e-6, True), (0.0, False)], ids=["a driver without status", "the last place known"]
+)
+def test_places_that_change_without_a_fix_are_told_of(step: float, said: bool, tmp_path: Path) -> None:
+    make = Messages(2)
+    at = [START_NS + k * S for k in range(20)]
+    items: list[Item] = [
+        ("/fix", t, make.fix(t, 57.7 + step * k, 11.9 - step * k, status=-1)) for k, t in enumerate(at)
+    ]
+    found, _, _ = look(tmp_path, items, make)
+    assert (
+        any("20 say 'no fix', though their places change: " in w and "`min_status: any`" in w for w in found.warnings)
+        is said
+    )
+
+
 def test_a_bag_that_no_sensor_can_be_made_of_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -126,8 +126,8 @@ class GnssConfig(SensorConfig):
 
     kind: Literal["gnss"] = "gnss"
     """The sensor kind."""
-    min_status: Literal["fix", "sbas", "gbas"] = "fix"
-    """Fixes below this `NavSatStatus` are rejected. `STATUS_NO_FIX` never counts as a fix."""
+    min_status: Literal["any", "fix", "sbas", "gbas"] = "fix"
+    """Fixes below this `NavSatStatus` are rejected; `any`: none are, for a driver that says `STATUS_NO_FIX` of all its fixes."""
     fixes: Literal["any", "rtk", "other"] = "any"
     """Which it reads: `rtk` those of status gbas, where there is one, that state less than 0.1 m (1 sigma, horizontal); `other` the rest. A
     receiver whose RTK comes and goes is two sensors of one topic, each with a slow error of its own: centimetres, and metres. Where both have the
