@@ -7,9 +7,8 @@
 c: meridian convergence at the estimated place: by how much north there lies counter-clockwise of the datum's north
 (`Datum.convergence_rad`). A: mount offset. B to E: deviation by the vessel's iron, as in navigation (A. Smith's coefficients; east is
 positive); A to E are constants of the run. e: wander, a first-order Gauss-Markov process, by a crane or a quay of sheet piles that
-the vessel passes, or by the compass's own filter; it may jump and stay far off, where iron is moved on board. If deviation or wander of
-some degrees are taken for white noise, ten readings per second seem certain: the heading is wrong by half of them, and true aerial
-matches are rejected.
+the vessel passes, or by the compass's own filter. If deviation or wander of some degrees are taken for white noise, ten readings per
+second seem certain: the heading is wrong by half of them, and true aerial matches are rejected.
 
 yaw(R) = atan2(R10, R00); its derivative by theta in R <- R Exp(theta): `_yaw_jacobian`. GTSAM has no factor of yaw and offset, so
 this one is linearised at every pass (`graphloc.linear`). Yaw is nearly linear in a correction: at 3 deg of roll and pitch, one of
@@ -119,7 +118,6 @@ def slow(config: CompassConfig) -> SlowProcess | None:
         sigma=sigma[there],
         time_constant_s=time_constant_s[there],
         no_tails=_DEVIATION,
-        jumps=config.wander_sigma_deg > 0.0,
     )
 
 

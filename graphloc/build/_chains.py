@@ -52,20 +52,20 @@ def bias_step(links: InertialLink, j: int, from_ns: int, to_ns: int) -> Any:
 
 
 def slow_begin(
-    slow: SlowProcess, key: int, known: Array | None, *, jumps: bool = True, far: bool = True, tails: bool = False
+    slow: SlowProcess, key: int, known: Array | None, *, jumps: bool = True, far: bool = True
 ) -> Iterator[Any]:
     """Yield the priors of the first node of a chain.
 
     Args:
         known: (k,) estimate of that node, by which the priors of constants are re-weighted; None: of these priors only
-            the part whose weight never changes (`never_revised`), and `slow_end` yields the other. jumps, far,
-            tails: as in `slow_step`.
+            the part whose weight never changes (`never_revised`), and `slow_end` yields the other. jumps, far: as in
+            `slow_step`.
     """
     constant = slow.constant
     if constant.any():
-        wider = np.where(_with_no_tails(slow), 1.0, _WIDEST) if known is None else _tails(slow, known)
-        yield _prior(key, slow.sigma * np.where(constant, wider, _NOTHING))
-    yield from _standing(slow, key, np.full(len(constant), _CHAIN_END), jumps=jumps, far=far, tails=tails)
+        tails = np.where(_with_no_tails(slow), 1.0, _WIDEST) if known is None else _tails(slow, known)
+        yield _prior(key, slow.sigma * np.where(constant, tails, _NOTHING))
+    yield from _standing(slow, key, np.full(len(constant), _CHAIN_END), jumps=jumps, far=far)
 
 
 def _with_no_tails(slow: SlowProcess) -> NDArray[np.bool_]:
@@ -107,19 +107,16 @@ def slow_step(
     jump_m: float = 0.0,
     expected: Array | None = None,
     anew: bool = False,
-    tails: bool = False,
 ) -> Iterator[Any]:
     """Yield the factors of the step to the next node, `dt_s` later.
 
     Args:
-        jumps: whether an error that may stay at another level (`SlowProcess.far`) may jump; others that may jump always
-            may. far: whether axes that may stay far off have a prior
+        jumps: whether steps that may be jumps have a robust loss. far: whether axes that may stay far off have a prior
             here; if not, `at_level` yields it.
         jump_m: size of a position jump seen in this step: the error, or the vessel, has moved so far. 0: none.
         expected: (k,) mean of the step, where a jump was measured; None: 0.
         anew: whether the error is drawn anew: all axes but constants are then independent of what they were
-            (`SlowProcess.anew_after_s`), so that one chain ends here and another begins. tails: whether an error that
-            jumps to no known level has priors with tails. Not where they are marginalised, and keep their weight.
+            (`SlowProcess.anew_after_s`), so that one chain ends here and another begins.
     """
     constant = slow.constant
     # A constant still gets a step of 1e-4 of its sigma: one key on every state would make the tree dense.
@@ -129,14 +126,14 @@ def slow_step(
     elif jump_m > 0.0:
         step = np.where(slow.far_axes, jump_m, step)
     model: Any = gtsam.noiseModel.Diagonal.Sigmas(step)
-    if slow.jumps and (jumps or not slow.far) and jump_m == 0.0 and not anew:
+    if slow.jumps and jumps and jump_m == 0.0 and not anew:
         model = _with_tails(model, JUMP.scale)
     yield gtsam.BetweenFactorVector(key, following, np.zeros(len(step)) if expected is None else expected, model)
     if anew:
-        yield from slow_end(slow, key, jumps=jumps, far=far, tails=tails)
-        yield from slow_end(slow, following, jumps=jumps, far=far, tails=tails)
+        yield from slow_end(slow, key, jumps=jumps, far=far)
+        yield from slow_end(slow, following, jumps=jumps, far=far)
     else:
-        yield from _standing(slow, following, 2.0 * slow.time_constant_s / dt_s, jumps=jumps, far=far, tails=tails)
+        yield from _standing(slow, following, 2.0 * slow.time_constant_s / dt_s, jumps=jumps, far=far)
 
 
 def without_drift(slow: SlowProcess) -> SlowProcess:
@@ -157,21 +154,15 @@ def silent_s(slow: SlowProcess, apart_s: float) -> float:
 
 
 def slow_end(
-    slow: SlowProcess,
-    key: int,
-    value: Array | None = None,
-    *,
-    jumps: bool = True,
-    far: bool = True,
-    tails: bool = False,
+    slow: SlowProcess, key: int, value: Array | None = None, *, jumps: bool = True, far: bool = True
 ) -> Iterator[Any]:
     """Yield the priors that close a chain at its last node.
 
     Args:
         value: (k,) estimate of that node, if the chain began without one (see `slow_begin`): the part of the constants'
-            priors whose weight may change is then yielded here. jumps, far, tails: as in `slow_step`.
+            priors whose weight may change is then yielded here. jumps, far: as in `slow_step`.
     """
-    yield from _standing(slow, key, np.full(len(slow.sigma), _CHAIN_END), jumps=jumps, far=far, tails=tails)
+    yield from _standing(slow, key, np.full(len(slow.sigma), _CHAIN_END), jumps=jumps, far=far)
     if value is not None and (slow.constant & ~_with_no_tails(slow)).any():
         variance = closing_variance(slow, value)
         yield _prior(key, np.where(slow.constant & np.isfinite(variance), np.sqrt(variance), _NOTHING * slow.sigma))
@@ -275,19 +266,17 @@ def _usual_information(
     return held
 
 
-def _standing(slow: SlowProcess, key: int, times: Array, *, jumps: bool, far: bool, tails: bool) -> Iterator[Any]:
+def _standing(slow: SlowProcess, key: int, times: Array, *, jumps: bool, far: bool) -> Iterator[Any]:
     """Yield the priors about 0 of a node; their variances are `times` (k,) those of the process.
 
     Constants have none here. Axes that may stay far off have a prior of their own, or none (`far`). In one prior with
     the others, a height above another zero would loosen the horizontal axes.
     """
     held, tailed = ~slow.constant & (far | ~slow.far_axes), slow.far_axes & jumps
-    if tails and slow.jumps and not slow.far:
-        tailed = ~slow.constant
     for part in (held & ~tailed, held & tailed):
         if part.any():
-            bend = _FAR / float(np.sqrt(times[part].max())) if tailed[part].all() else None
-            yield _prior(key, slow.sigma * np.where(part, np.sqrt(times), _NOTHING), bend)
+            tails = _FAR / float(np.sqrt(times[part].max())) if tailed[part].all() else None
+            yield _prior(key, slow.sigma * np.where(part, np.sqrt(times), _NOTHING), tails)
 
 
 def _prior(key: int, sigmas: Array, tails: float | None = None) -> Any:

@@ -146,7 +146,7 @@ def build_graph(
     Args:
         values: the estimate at which factors that depend on it are built. decisions: on the measurements.
         prior: on the first state.
-        jumps: whether slow states with levels (`SlowProcess.far`) may jump. Not while the estimate may be far off: a GNSS
+        jumps: whether slow states may jump where their process allows it. Not while the estimate may be far off: a GNSS
             error that may jump explains a dead-reckoned track that is 300 m off at less cost than correcting the track.
         made: filled with the range of factors of each measurement in the graph. The factors between states come before
             them.
@@ -256,7 +256,7 @@ def _step(
 
     They do not depend on the estimate, so they are made once and shared by all graphs.
     """
-    return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, far=far, jump_m=jump_m, anew=anew, tails=True))
+    return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, far=far, jump_m=jump_m, anew=anew))
 
 
 def _jumps_m(problem: Problem, stream: Stream) -> dict[int, float]:
@@ -319,13 +319,13 @@ def _add_slow_chain(
         if (given := prior.slow.get(stream.number)) is not None:
             graph.add(gtsam.PriorFactorVector(key[0], given[0], gtsam.noiseModel.Gaussian.Covariance(given[1])))
         else:
-            for factor in slow_begin(slow, key[0], values.atVector(key[0]), jumps=jumps, far=far, tails=True):
+            for factor in slow_begin(slow, key[0], values.atVector(key[0]), jumps=jumps, far=far):
                 graph.add(factor)
     sizes_m, anew = _jumps_m(problem, stream), np.isin(nodes[:-1], stream.anew)
     for n, j in enumerate(nodes[:-1]):
         for factor in _step(slow, key[n], key[n + 1], dt_s[n], jumps, far, sizes_m.get(j, 0.0), bool(anew[n])):
             graph.add(factor)
-    for factor in slow_end(slow, key[-1], jumps=jumps, far=far, tails=True):
+    for factor in slow_end(slow, key[-1], jumps=jumps, far=far):
         graph.add(factor)
     if stream.usual is not None:
         for factor in at_level(slow, key, np.array(dt_s), stream.usual[nodes.start : nodes.stop], anew):
