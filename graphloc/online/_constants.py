@@ -55,6 +55,7 @@ class Constants:
         self._priors: dict[int, tuple[Held, Array]] = {}
         # By state: its yaw (rad) when states before it were last marginalised, turned by `turned_rad` of that time
         self._first_yaw_rad: dict[int, float] = {}
+        self._guessed = False
         for stream in problem.streams.values():
             for n, (key, constant) in enumerate(zip(constant_keys(stream), stream.constants, strict=True)):
                 if (found := known.get((stream.name, n))) is None:
@@ -87,7 +88,7 @@ class Constants:
         """
         first = self._problem.timeline.first
         turned_rad = math.remainder(self._first_yaw_rad[first] - self._yaw_rad(first), math.tau)
-        return turned_rad if abs(turned_rad) < _ASTRAY_RAD else 0.0
+        return turned_rad if abs(turned_rad) < _ASTRAY_RAD and not self._guessed else 0.0
 
     def _yaw_rad(self, k: int) -> float:
         return float(self._window.values.atPose3(keys.pose(k)).rotation().yaw())
@@ -96,8 +97,14 @@ class Constants:
         """Return the attitude (3, 3) at which derivatives by constants are taken, at an estimated pose."""
         return np.asarray((gtsam.Rot3.Rz(self.turned_rad) * pose.rotation()).matrix())
 
-    def hold_turn(self) -> None:
-        """Hold the attitudes for derivatives by constants, before states are marginalised."""
+    def hold_turn(self, *, guessed: bool) -> None:
+        """Hold the attitudes for derivatives by constants, before states are marginalised.
+
+        Args:
+            guessed: whether the heading is a guess. They are then those of the estimate: held, they kept a guess from being
+                corrected.
+        """
+        self._guessed = guessed
         turned_rad, timeline = self.turned_rad, self._problem.timeline
         states = range(timeline.first, len(timeline))
         self._first_yaw_rad = {k: self._yaw_rad(k) + turned_rad for k in states}

@@ -101,8 +101,8 @@ class Lag:
         self._entries.reintegrate(stale)
         self._states.reintegrate(stale)
 
-    def commit(self) -> None:
-        """Solve with what is staged, and forget what has been marginalised."""
+    def commit(self, *, guessed: bool = False) -> None:
+        """Solve with what is staged, and forget what has been marginalised; `guessed`: whether the heading is a guess."""
         timeline, window = self.problem.timeline, self._window
         pose, now_s = keys.pose(timeline.last), timeline.page_s(timeline.stamps_ns[timeline.last])
         self.fresh = now_s > self._page_s
@@ -111,7 +111,7 @@ class Lag:
             window.relinearise()
             self._entries.follow_solver()
             self._constants.revise()
-            self._constants.hold_turn()
+            self._constants.hold_turn(guessed=guessed)
         self._constants.remember(now_s)
         before = window.values.atPose3(pose).translation()
         window.commit()

@@ -196,7 +196,7 @@ class Tracking:
             self._take_pending(reached_ns)
             lag.judge()
             advance_odometry(self._odometry, lag.problem, lag.newest, reached_ns)
-            lag.commit()
+            lag.commit(guessed=self._persistent.heading is not None)
             lag.try_others()
             self._follow_unmodelled()
         self._ledger.enter(lag.gone())
@@ -233,7 +233,7 @@ class Tracking:
         """Solve again if IMU samples came late since the newest state, which was predicted without them."""
         if self._holes:
             self._read_imu()
-            self.lag.commit()
+            self.lag.commit(guessed=self._persistent.heading is not None)
 
     def _grow(self, until_ns: int) -> None:
         """Stage the next states: until slow states get a new node, but at most `_AT_ONCE`."""
