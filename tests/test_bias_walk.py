@@ -176,7 +176,7 @@ def test_a_window_that_is_built_anew_forgets_what_was_known(
         again.append(1)
         begun(self)
 
-    def fails(_self: Lag) -> None:
+    def fails(_self: Lag, **_options: bool) -> None:
         monkeypatch.setattr(Lag, "commit", whole)
         monkeypatch.setattr(BiasWalk, "begin", counted)
         raise RuntimeError("planted")

@@ -116,7 +116,7 @@ def two_seconds_later(online: OnlineSmoother, monkeypatch: pytest.MonkeyPatch, *
     """The last estimate, of a solver that fails, or not, at their begin."""
     whole, estimates = Lag.commit, list[Estimate]()
 
-    def once(self: Lag) -> None:
+    def once(self: Lag, **_options: bool) -> None:
         monkeypatch.setattr(Lag, "commit", whole)
         raise RuntimeError("planted")
 
