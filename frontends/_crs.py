@@ -4,10 +4,14 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from typing import Any
 
-_LOOSE_M = 1.5  # a tie to WGS 84 with a larger uncertainty is warned of; ties of ETRS 89 state 1 m
+from pyproj.transformer import AreaOfInterest, TransformerGroup
 
+from graphloc.frames import Datum
+
+_LOOSE_M = 1.5  # a tie to WGS 84 with a larger uncertainty is warned of; ties of ETRS 89 state 1 m
 _ALIKE = ("WGS 84", "GRS 1980")  # ellipsoids of datums that are within a metre or two of WGS 84
 
 log = logging.getLogger(__name__)
@@ -22,6 +26,20 @@ def check_metric(what: str, crs: Any) -> None:
     axes = {(axis.direction, axis.unit_name) for axis in crs.axis_info[:2]}
     if not crs.is_projected or axes != {("east", "metre"), ("north", "metre")}:
         raise ValueError(f"{what} ({crs.name}) does not count metres east and north")
+
+
+def ties_near(datum: Datum, source: Any, target: Any) -> list[Any]:
+    """Return the transformations (pyproj) between two CRS, the best near the datum first; east and longitude come first.
+
+    Raises:
+        pyproj.exceptions.ProjError: one of the CRS cannot be used.
+    """
+    lon, lat = datum.origin.longitude_deg, datum.origin.latitude_deg
+    lon -= 360.0 if lon > 180.0 else 0.0  # a datum may say 190 deg, PROJ's areas may not
+    here = AreaOfInterest(lon, lat, lon, lat)  # which tie to WGS 84 is best depends on where
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a better tie needs a grid file; `warn_of_loose_tie` says so
+        return list(TransformerGroup(source, target, always_xy=True, area_of_interest=here).transformers)
 
 
 def warn_of_loose_tie(what: str, crs: Any, accuracy_m: float) -> None:

@@ -36,6 +36,7 @@ SCATTERED = (
 )
 # Tilt: crossover time from gyroscope to accelerometer, longer than a wave; a craft is seldom tilted by more.
 _TILT_S, _UPRIGHT_RAD = 5.0, 0.8
+_GRAVITY_MPS2 = 5.0  # median acceleration below which there is no gravity in it
 _TILT_RAD = np.radians(1.0)  # error of the tilt, 1 sigma: turns are felt as tilt; a choice
 WANDERS_DEG = 1.0
 """Least wander of a compass beside the gyroscope that is said, 1 sigma: a smaller one may be the comparison's error."""
@@ -398,7 +399,7 @@ def without_tilt(
     Of a compass whose x axis is tilted by p, a roll r turns the heading by r tan(p). Roll and pitch are by the IMU, and
     what they leave open, as in turns, is added to the sigmas; without gravity, or of no upright craft, the headings are returned as they are.
     """
-    if not len(imu.stamps_ns) or float(np.linalg.norm(np.median(imu.accel_mps2, axis=0))) < 5.0:  # m/s^2
+    if not len(imu.stamps_ns) or float(np.linalg.norm(np.median(imu.accel_mps2, axis=0))) < _GRAVITY_MPS2:
         return list(headings)
     t = (imu.stamps_ns - imu.stamps_ns[0]) / NS_PER_S
     roll, pitch = _roll_pitch(t, imu.accel_mps2 @ R_body_imu.T, imu.gyro_radps @ R_body_imu.T)
@@ -446,7 +447,7 @@ def _blocks(
     Nothing is yielded without gravity, or of fewer than 20 yaws.
     """
     up = np.median(imu.accel_mps2, axis=0) if len(imu.stamps_ns) else np.zeros(3)
-    if float(np.linalg.norm(up)) < 5.0 or len(yaws[0]) < 20:  # m/s^2: no gravity in it
+    if float(np.linalg.norm(up)) < _GRAVITY_MPS2 or len(yaws[0]) < 20:
         return
     t = (imu.stamps_ns - imu.stamps_ns[0]) / NS_PER_S
     turned = integral(t, yaw_rate(t, imu.accel_mps2, imu.gyro_radps, up))

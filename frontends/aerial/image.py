@@ -20,12 +20,11 @@ import rasterio
 from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import ProjError
-from pyproj.transformer import AreaOfInterest, TransformerGroup
 from rasterio.enums import ColorInterp, Resampling
 
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
-from graphloc.frontends._crs import warn_of_loose_tie
+from graphloc.frontends._crs import ties_near, warn_of_loose_tie
 from graphloc.frontends.aerial.tiles import describe_tiles
 
 Pixels = NDArray[np.uint8]
@@ -228,14 +227,9 @@ def _tie(path: Path, wkt: str, datum: Datum) -> Any:
     Raises:
         InputError: there is none.
     """
-    lon, lat = datum.origin.longitude_deg, datum.origin.latitude_deg
-    lon -= 360.0 if lon > 180.0 else 0.0  # a datum may say 190 deg, PROJ's areas may not
     try:
         crs = CRS.from_wkt(wkt)
-        here = AreaOfInterest(lon, lat, lon, lat)  # which tie to WGS 84 is best depends on where
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # a better tie needs a grid file; loose ones are logged below
-            ties = TransformerGroup(4326, crs, always_xy=True, area_of_interest=here).transformers
+        ties = ties_near(datum, 4326, crs)
     except ProjError as error:
         raise InputError(f"{path}: its CRS cannot be used ({_line(error)})") from None
     if not ties:

@@ -3,15 +3,12 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from pyproj import CRS
 from pyproj.exceptions import ProjError
-from pyproj.transformer import AreaOfInterest, TransformerGroup
 
 from graphloc.frames import Array, Datum
-from graphloc.frontends._crs import check_metric, warn_of_loose_tie
+from graphloc.frontends._crs import check_metric, ties_near, warn_of_loose_tie
 from graphloc.survey import WORLD, Survey
 
 _AHEAD_M = 10.0  # distance over which the direction of grid north is computed
@@ -54,14 +51,9 @@ class _Grid:
     """A map grid, seen from a datum."""
 
     def __init__(self, name: str, datum: Datum) -> None:
-        longitude = datum.origin.longitude_deg
-        longitude -= 360.0 if longitude > 180.0 else 0.0  # a datum may say 190 deg, PROJ's areas may not
-        here = AreaOfInterest(longitude, datum.origin.latitude_deg, longitude, datum.origin.latitude_deg)
         try:
             crs = CRS.from_user_input(name)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # a better tie needs a file; loose ones are logged below
-                ties = TransformerGroup(crs, 4326, always_xy=True, area_of_interest=here).transformers
+            ties = ties_near(datum, crs, 4326)
         except ProjError:
             raise ValueError(f"grid {name} is not known") from None
         check_metric(f"grid {name}", crs)

@@ -87,6 +87,8 @@ class Constants:
         0 after a correction by so much that steps along these would lead the constants astray.
         """
         first = self._problem.timeline.first
+        if first not in self._first_yaw_rad:  # there are no constants
+            return 0.0
         turned_rad = math.remainder(self._first_yaw_rad[first] - self._yaw_rad(first), math.tau)
         return turned_rad if abs(turned_rad) < _ASTRAY_RAD and not self._guessed else 0.0
 
@@ -104,6 +106,8 @@ class Constants:
             guessed: whether the heading is a guess. They are then those of the estimate: held, they kept a guess from being
                 corrected.
         """
+        if not any(stream.constants for stream in self._problem.streams.values()):
+            return
         self._guessed = guessed
         turned_rad, timeline = self.turned_rad, self._problem.timeline
         states = range(timeline.first, len(timeline))

@@ -343,8 +343,8 @@ class States:
         j = timeline.slow_of[k]
         core = [keys.pose(k), keys.velocity(k), keys.bias(j)]
         slow = {s.name: keys.slow(s.number, j) for s in streams.values() if s.slow is not None}
-        seen = self._constants.seen()
-        every = [*core, *slow.values(), *seen.values()]
+        constants = self._constants.seen()
+        every = [*core, *slow.values(), *constants.values()]
         joint = window.covariance(every)
         vectors = [window.values.atVector(key) for key in every[3:]]
         mean = np.concatenate([np.zeros(15), *vectors])
@@ -353,7 +353,7 @@ class States:
             process = streams[name].slow
             assert process is not None
             variances.append(closing_variance(process, np.where(process.constant, self._ends[name][1], value)))
-        variances += map(self._constants.revisable_variance, seen.values())
+        variances += map(self._constants.revisable_variance, constants.values())
         mean, joint = without_priors(mean, joint, np.concatenate([np.full(15, np.inf), *variances]))
         bias = window.values.atConstantBias(core[2])
         anchor = Anchor.of_joint(
@@ -362,10 +362,10 @@ class States:
             mean,
             joint,
             dict(zip(slow, map(len, vectors), strict=False)),
-            dict(zip(seen, map(len, vectors[len(slow) :]), strict=True)),
+            dict(zip(constants, map(len, vectors[len(slow) :]), strict=True)),
         )
-        constants = {**self._constants.remembered(), **anchor.constants}
-        return replace(anchor, constants=constants, turned_rad=self._constants.turned_rad)
+        every_constant = {**self._constants.remembered(), **anchor.constants}
+        return replace(anchor, constants=every_constant, turned_rad=self._constants.turned_rad)
 
     def track(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
         """Return stamps (N,), ns; and positions (N, 3), attitudes (N, 3, 3), velocities (N, 3) of the body in world."""
