@@ -118,6 +118,8 @@ def slow(config: CompassConfig) -> SlowProcess | None:
         sigma=sigma[there],
         time_constant_s=time_constant_s[there],
         no_tails=_DEVIATION,
+        # Iron that is moved on board, or a wrong fix of a GNSS compass, adds a constant.
+        stepped=("yaw",) if there[0] else ("wander",),
     )
 
 

@@ -104,7 +104,7 @@ def slow_step(
     *,
     jumps: bool = True,
     far: bool = True,
-    jump_m: float = 0.0,
+    jump: float = 0.0,
     expected: Array | None = None,
     anew: bool = False,
 ) -> Iterator[Any]:
@@ -113,7 +113,8 @@ def slow_step(
     Args:
         jumps: whether steps that may be jumps have a robust loss. far: whether axes that may stay far off have a prior
             here; if not, `at_level` yields it.
-        jump_m: size of a position jump seen in this step: the error, or the vessel, has moved so far. 0: none.
+        jump: size (m, rad) of a jump of positions or a step of headings seen in this step: the error, or the vessel, has
+            moved so far. 0: none.
         expected: (k,) mean of the step, where a jump was measured; None: 0.
         anew: whether the error is drawn anew: all axes but constants are then independent of what they were
             (`SlowProcess.anew_after_s`), so that one chain ends here and another begins.
@@ -123,10 +124,10 @@ def slow_step(
     step = slow.sigma * np.where(constant, 1e-4, np.sqrt(2.0 * dt_s / slow.time_constant_s))
     if anew:
         step = np.where(constant, step, slow.sigma * _NOTHING)
-    elif jump_m > 0.0:
-        step = np.where(slow.far_axes, jump_m, step)
+    elif jump > 0.0:
+        step = np.where(slow.jump_axes, jump, step)
     model: Any = gtsam.noiseModel.Diagonal.Sigmas(step)
-    if slow.jumps and jumps and jump_m == 0.0 and not anew:
+    if slow.jumps and jumps and jump == 0.0 and not anew:
         model = _with_tails(model, JUMP.scale)
     yield gtsam.BetweenFactorVector(key, following, np.zeros(len(step)) if expected is None else expected, model)
     if anew:
@@ -134,6 +135,13 @@ def slow_step(
         yield from slow_end(slow, following, jumps=jumps, far=far)
     else:
         yield from _standing(slow, following, 2.0 * slow.time_constant_s / dt_s, jumps=jumps, far=far)
+
+
+def after_step(slow: SlowProcess, key: int, value: Array) -> Iterator[Any]:
+    """Yield the prior of the constants that a step has moved, re-weighted at a value (k,): many come back from where they went."""
+    moved = slow.jump_axes & slow.constant
+    if moved.any():
+        yield _prior(key, np.where(moved, slow.sigma * _tails(slow, value), _NOTHING * slow.sigma))
 
 
 def without_drift(slow: SlowProcess) -> SlowProcess:

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphloc import keys
 from graphloc.build._attach import constants_of
-from graphloc.build._chains import at_level, bias_step, slow_begin, slow_end, slow_step
+from graphloc.build._chains import after_step, at_level, bias_step, slow_begin, slow_end, slow_step
 from graphloc.build._problem import Problem, Stream
 from graphloc.frames import Array, skew
 from graphloc.graph import Attachment, Decision, GraphUpdate, Residual, SlowProcess
@@ -250,30 +250,31 @@ def _add_constants(
 
 @lru_cache(maxsize=1 << 14)
 def _step(
-    slow: SlowProcess, key: int, following: int, dt_s: float, jumps: bool, far: bool, jump_m: float, anew: bool
+    slow: SlowProcess, key: int, following: int, dt_s: float, jumps: bool, far: bool, jump: float, anew: bool
 ) -> tuple[Any, ...]:
     """Return the factors of a step of a slow state (`slow_step`).
 
     They do not depend on the estimate, so they are made once and shared by all graphs.
     """
-    return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, far=far, jump_m=jump_m, anew=anew))
+    return tuple(slow_step(slow, key, following, dt_s, jumps=jumps, far=far, jump=jump, anew=anew))
 
 
-def _jumps_m(problem: Problem, stream: Stream) -> dict[int, float]:
-    """Return, by slow node, the size (m) of the position jump in the step to the next node.
+def _jumps_of(problem: Problem, stream: Stream) -> dict[int, float]:
+    """Return, by slow node, the size (m, rad) of the jump or step in the measurements from there to the next node.
 
-    A jump is somewhere between the last fix before it and the first fix after it, so each step between these has its
+    It is somewhere between the last measurement before it and the first after it, so each step between these has its
     size.
     """
     found: dict[int, float] = {}
-    if not len(stream.position_jumps[0]):
+    seen = [*zip(*stream.position_jumps, strict=True), *((s.after_ns, s.size_rad) for s in stream.heading_steps)]
+    if not seen or not stream.measurements:
         return found
     nodes_ns = problem.timeline.slow_stamps_ns
     stamps_ns = [m.stamp_ns for m in stream.measurements]
-    for at_ns, off_m in zip(*stream.position_jumps, strict=True):
+    for at_ns, size in seen:
         before_ns = stamps_ns[max(int(np.searchsorted(stamps_ns, at_ns)) - 1, 0)]
         first, last = np.searchsorted(nodes_ns, [before_ns, at_ns], side="right") - 1
-        found |= dict.fromkeys(range(int(first), int(last) + 1), float(off_m))
+        found |= dict.fromkeys(range(int(first), int(last) + 1), abs(float(size)))
     return found
 
 
@@ -321,10 +322,13 @@ def _add_slow_chain(
         else:
             for factor in slow_begin(slow, key[0], values.atVector(key[0]), jumps=jumps, far=far):
                 graph.add(factor)
-    sizes_m, anew = _jumps_m(problem, stream), np.isin(nodes[:-1], stream.anew)
+    sizes, anew = _jumps_of(problem, stream), np.isin(nodes[:-1], stream.anew)
     for n, j in enumerate(nodes[:-1]):
-        for factor in _step(slow, key[n], key[n + 1], dt_s[n], jumps, far, sizes_m.get(j, 0.0), bool(anew[n])):
+        for factor in _step(slow, key[n], key[n + 1], dt_s[n], jumps, far, sizes.get(j, 0.0), bool(anew[n])):
             graph.add(factor)
+        if j in sizes and j + 1 not in sizes and slow.stepped:
+            for factor in after_step(slow, key[n + 1], values.atVector(key[n + 1])):
+                graph.add(factor)
     for factor in slow_end(slow, key[-1], jumps=jumps, far=far):
         graph.add(factor)
     if stream.usual is not None:

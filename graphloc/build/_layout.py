@@ -23,8 +23,10 @@ from graphloc.graph import PLACE, Constant, Sensor, SlowProcess
 from graphloc.inertial import InertialLink, InertialRow
 from graphloc.measurements import Measurement
 from graphloc.recording import Mounts, Recording
+from graphloc.signals.heading_steps import HeadingStep, heading_steps
 from graphloc.signals.pauses import common_pauses, pauses_warning
 from graphloc.signals.position_jumps import position_jumps
+from graphloc.signals.series import integral
 from graphloc.time import NS_PER_S, stamps_of, utc_text
 from graphloc.timeline import Timeline, make_timeline
 
@@ -247,6 +249,7 @@ def _streams(
                 left_out=left_out,
                 without_height=by_waterline,
                 position_jumps=jumps,
+                heading_steps=_heading_steps(problem, row, own, slow),
                 constants=constants,
                 shares=shares,
                 mount=gtsam.Pose3(gtsam.Rot3(R), t - problem.t_body_imu_m),
@@ -317,6 +320,26 @@ def _position_jumps(row: Sensor, measurements: Sequence[Measurement], datum: Dat
     places_m = np.array([hint.p_world_m[:2] for _, hint in told])
     sigma_m = np.array([hint.p_sigma_m[:2].max() for _, hint in told])
     return position_jumps(stamps_ns, places_m, sigma_m, allowed_m=allowed_m)
+
+
+def _heading_steps(
+    problem: Problem, row: Sensor, measurements: Sequence[Measurement], slow: SlowProcess | None
+) -> tuple[HeadingStep, ...]:
+    """Return the steps of a compass's headings."""
+    imu, stamps_ns = problem.imu, stamps_of(measurements)
+    if slow is None or not slow.stepped or len(imu.stamps_ns) < 2:
+        return ()
+    hints = [row.hint(m, 0.0, problem.datum) for m in measurements]
+    yaw_rad, sigma_rad = (
+        np.array(column) for column in zip(*((h.yaw_rad, h.yaw_sigma_rad) for h in hints), strict=True)
+    )
+    origin_ns = imu.stamps_ns[0]
+    t_s, at_s = ((stamps - origin_ns) / NS_PER_S for stamps in (imu.stamps_ns, stamps_ns))
+    turned_rad = np.interp(at_s, t_s, integral(t_s, imu.gyro_radps @ problem.R_body_imu[2]))
+    blind = np.zeros(max(len(stamps_ns) - 1, 0), dtype=bool)
+    for begin_ns, end_ns in problem.links.gaps():
+        blind |= (stamps_ns[:-1] < end_ns) & (stamps_ns[1:] > begin_ns)
+    return tuple(heading_steps(stamps_ns, yaw_rad, turned_rad, sigma_rad, blind))
 
 
 def _states_and_carries(

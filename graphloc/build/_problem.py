@@ -24,6 +24,7 @@ from graphloc.graph import Constant, Sensor, SlowProcess
 from graphloc.inertial import GapMotion, InertialLink
 from graphloc.ledger import LedgerRow
 from graphloc.measurements import ImuSeries, Measurement
+from graphloc.signals.heading_steps import HeadingStep
 from graphloc.time import NS_PER_S, stamps_of
 from graphloc.timeline import Timeline
 
@@ -40,6 +41,7 @@ class Stream:
         slow: its slow state, or None. left_out: the slow state that it would have beside a second position sensor, or
             None.
         position_jumps: those of a receiver that alone measures position.
+        heading_steps: those of a compass.
         constants: those that its measurements depend on.
         mount: pose of the sensor seen from the IMU, body axes (gtsam.Pose3).
         measurements: M of them by stamp. state: (M,) the state of each (`state_of`). carry: for each, the preintegrated
@@ -61,6 +63,7 @@ class Stream:
     slow: SlowProcess | None
     left_out: SlowProcess | None
     position_jumps: PositionJumps
+    heading_steps: tuple[HeadingStep, ...]
     constants: tuple[Constant, ...]
     mount: Any
     measurements: tuple[Measurement, ...]

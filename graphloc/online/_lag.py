@@ -276,9 +276,9 @@ class Lag:
 
     @property
     def unmodelled_jumps(self) -> list[str]:
-        """Names of the receivers that have jumped since the window was built, and whose jumps a window can estimate."""
-        streams = self.problem.streams.items()
-        return [n for n, s in streams if s.may_jump and s.receiver.jump.jumps != s.jumps]
+        """Which sensors have jumped since the window was built, where a window can estimate it: lines for users."""
+        jumped = [s for s in self.problem.streams.values() if s.may_jump and s.receiver.jumps != s.jumps]
+        return [f"{'heading step' if s.receiver.heading.steps else 'position jump'} of {s.name}" for s in jumped]
 
     def in_doubt(self, stamp_ns: int) -> str:
         """Return why the health cannot be good at a stamp; empty where nothing is wrong.

@@ -40,6 +40,7 @@ from graphloc.online._repeated_fix import RepeatedFixDetector
 from graphloc.online._repeated_velocity import RepeatedVelocityDetector
 from graphloc.online._scatter import Scatter
 from graphloc.online._setup import Setup
+from graphloc.signals.heading_steps import HeadingStep, HeadingStepDetector
 from graphloc.signals.position_jumps import JumpDetector, PositionJump
 from graphloc.time import NS_PER_S, duration_ns
 
@@ -158,11 +159,12 @@ class LiveTimeline:
 
 @dataclass(slots=True, eq=False)
 class ReceiverDetectors:
-    """Detectors of a receiver's repetitions, position jumps and wrong settings; they outlive the window."""
+    """Detectors of a sensor's repetitions, jumps, steps and wrong settings; they outlive the window."""
 
     repeated_fix: RepeatedFixDetector = field(default_factory=RepeatedFixDetector)
     repeated_velocity: RepeatedVelocityDetector = field(default_factory=RepeatedVelocityDetector)
     jump: JumpDetector = field(default_factory=JumpDetector)
+    heading: HeadingStepDetector = field(default_factory=HeadingStepDetector)
     far_off: dict[str, float] = field(default_factory=dict)
     """Settings that users were warned of as far from the estimate, and by how much they were off then."""
 
@@ -170,6 +172,12 @@ class ReceiverDetectors:
         """Forget what was found with the estimate, which is given up; a restart does not change levels of fixes."""
         self.repeated_fix, self.repeated_velocity = RepeatedFixDetector(), RepeatedVelocityDetector()
         self.jump.forget()
+        self.heading = HeadingStepDetector()
+
+    @property
+    def jumps(self) -> tuple[PositionJump | HeadingStep, ...]:
+        """The jumps of positions and steps of headings found since the estimate started."""
+        return (*self.jump.jumps, *self.heading.steps)
 
 
 @dataclass(slots=True, eq=False)
@@ -187,7 +195,7 @@ class LiveStream:
         scatter: by what factor its residuals scatter more than stated.
         frozen_detector: finds that its position stays while the estimate moves; a new window begins with a new one.
         receiver: detectors that outlive the window.
-        jumps: position jumps that the window estimates.
+        jumps: jumps of positions, or steps of headings, that the window estimates.
         told_ns: newest stamp of its measurements. anew_ns: `told_ns` when its slow error was last drawn anew; None: it
             never was.
     """
@@ -210,7 +218,7 @@ class LiveStream:
     scatter: Scatter = field(default_factory=Scatter)
     frozen_detector: FrozenReceiverDetector = field(default_factory=FrozenReceiverDetector)
     receiver: ReceiverDetectors = field(default_factory=ReceiverDetectors)
-    jumps: tuple[PositionJump, ...] = ()
+    jumps: tuple[PositionJump | HeadingStep, ...] = ()
     told_ns: int = 0
     anew_ns: int | None = None
     shares: int | None = None
@@ -223,8 +231,8 @@ class LiveStream:
 
     @property
     def may_jump(self) -> bool:
-        """Whether position jumps of the receiver can be estimated as its slow error."""
-        return self.left_out is not None or (self.slow is not None and self.slow.jumps)
+        """Whether jumps of its positions, or steps of its headings, can be estimated as its slow error."""
+        return self.left_out is not None or (self.slow is not None and (self.slow.jumps or bool(self.slow.stepped)))
 
     @property
     def noisier(self) -> float:
@@ -266,16 +274,17 @@ class LiveStream:
             tape.forget(before)
 
     def jumped(self, after_ns: int, until_ns: int) -> tuple[float, Array | None]:
-        """Return the largest jump (m) with `after_ns` < stamp <= `until_ns`, and the slow error (k,) that all add.
+        """Return the largest jump (m, rad) with `after_ns` < stamp <= `until_ns`, and the slow error (k,) that all add.
 
         0 and None where there is no jump.
         """
         found = [j for j in self.jumps if after_ns < j.after_ns <= until_ns]
-        if self.slow is None or not found or not self.slow.far:
+        if self.slow is None or not found or not self.slow.jump_axes.any():
             return 0.0, None
-        far, step = self.slow.far_axes, np.zeros(len(self.slow.axes))
-        step[far] = np.sum([(j.east_m, j.north_m) for j in found], axis=0) / self.slow.scale[far]
-        return max(j.size_m for j in found), step
+        moved, step = self.slow.jump_axes, np.zeros(len(self.slow.axes))
+        added = np.array([j.parts for j in found]) / self.slow.scale[moved]
+        step[moved] = added.sum(axis=0)
+        return float(np.linalg.norm(added, axis=1).max()), step
 
 
 @dataclass(slots=True, eq=False)
@@ -428,6 +437,6 @@ def _live_stream(
         mount=gtsam.Pose3(gtsam.Rot3(R), t - t_body_imu_m),
         scatter=Scatter(jumps=slow is not None and slow.jumps),
         receiver=receiver,
-        jumps=receiver.jump.jumps,
+        jumps=receiver.jumps,
         told_ns=start_ns,
     )

@@ -11,7 +11,7 @@ import numpy as np
 from graphloc import gauss
 from graphloc.build import allowed_jump_m
 from graphloc.frames import Array
-from graphloc.graph import TIME_OFFSET, Attachment, Residual, antenna_off_m, corrections
+from graphloc.graph import TIME_OFFSET, Attachment, Hint, Residual, antenna_off_m, corrections
 from graphloc.measurements import Measurement
 from graphloc.online._agreement import Agreement
 from graphloc.online._entries import Entries
@@ -19,6 +19,7 @@ from graphloc.online._frozen_receiver import WINDOW_S
 from graphloc.online._live import LiveProblem, LiveStream
 from graphloc.online._states import States
 from graphloc.signals.frozen_receiver import FROZEN, FROZEN_VELOCITY
+from graphloc.signals.heading_steps import step_warnings
 from graphloc.signals.position_jumps import (
     OffPrediction,
     jump_warnings,
@@ -57,6 +58,8 @@ class ReceiverChecks:
             repeated = stream.receiver.repeated_velocity
             repeated.note(m.stamp_ns, hint.v_world_mps)
             return FROZEN_VELOCITY if repeated.is_old(m.stamp_ns, hint.v_world_mps) else ""
+        if stream.slow is not None and stream.slow.stepped and np.isfinite(hint.yaw_rad):
+            self._check_heading(stream, m.stamp_ns, at, hint)
         told_m = hint.p_world_m[:2]
         if not stream.row.absolute or not np.isfinite(told_m).all():
             return ""
@@ -112,7 +115,7 @@ class ReceiverChecks:
             off_m: (2,) from the estimated position to the fix, slow error not removed.
         """
         slow = stream.left_out or (stream.slow if self._problem.others_of_place(stream.name) else None)
-        if slow is None or not slow.jumps or stream.receiver.jump.jumps != stream.jumps:
+        if slow is None or not slow.jumps or stream.receiver.jumps != stream.jumps:
             return None
         without = residual.raw
         if stream.slow is not None and at.slow_value is not None and residual.slow_jacobian is not None:
@@ -134,6 +137,17 @@ class ReceiverChecks:
         allowed = slow is not None
         found = stream.receiver.jump.note(stamp_ns, told_m, sigma_m, allowed_m=allowed_jump_m(slow), off=off)
         self._warnings += jump_warnings(stream.name, *found, allowed=allowed, followed=not allowed)
+
+    def _check_heading(self, stream: LiveStream, stamp_ns: int, at: Attachment, hint: Hint) -> None:
+        """Look for a step of the headings that the gyroscope does not show; the window is rebuilt with it."""
+        detector, links = stream.receiver.heading, self._problem.links
+        last_ns, turned_rad = detector.last_ns, None
+        if last_ns is not None and self._problem.timeline.stamps_ns[self._problem.timeline.first] <= last_ns < stamp_ns:
+            if not any(begin_ns < stamp_ns and end_ns > last_ns for begin_ns, end_ns in links.gaps()):
+                turn = links.integrate(last_ns, stamp_ns, self._states.newest.bias).deltaRij()
+                turned_rad = float(gtsam.Rot3.Logmap(turn) @ at.T_world_body.rotation().matrix()[2])
+        found = detector.note(stamp_ns, hint.yaw_rad, turned_rad, hint.yaw_sigma_rad)
+        self._warnings += step_warnings(stream.name, found)
 
     def _reject_since(self, stream: LiveStream, since_ns: int, until_ns: int) -> None:
         """Take the fixes of an interval out of the graph: they have pulled the estimate along."""

@@ -316,7 +316,7 @@ class OnlineSmoother:
             if (again := self._start_with_heading(tracking, until_ns, known)) is not None:
                 return self._start_over(tracking, tracking.lag.first_ns, *again)
             if jumped := tracking.lag.unmodelled_jumps:
-                self._rebuild(f"position jump of {', '.join(jumped)}")
+                self._rebuild(", ".join(jumped))
                 return self._estimate()
             persistent = self._persistent
             if noise := persistent.sensor_noise.changed(tracking.lag):

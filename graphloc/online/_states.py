@@ -202,7 +202,7 @@ class States:
             if stream.slow is None:
                 continue
             key, following = (keys.slow(stream.number, n) for n in (j, j + 1))
-            jump_m, step = self._jumped(stream, j, j + 1)
+            jump, step = self._jumped(stream, j, j + 1)
             anew = stream.drawn_anew(self._problem.timeline.slow_stamps_ns[j + 1])
             value = (
                 np.where(stream.slow.constant, window.values.atVector(key), 0.0)
@@ -211,8 +211,9 @@ class States:
             )
             # The guess includes the step of a jump: begun at the level before it, the slow error would be held at the
             # usual level by the prior that closes the chain, and the pose would be drawn along.
-            window.guess(following, value + (0.0 if step is None else step), t)
-            window.add(slow_step(stream.slow, key, following, dt_s, jump_m=jump_m, expected=step, anew=anew))
+            value = value if step is None else value + step
+            window.guess(following, value, t)
+            window.add(slow_step(stream.slow, key, following, dt_s, jump=jump, expected=step, anew=anew))
             if window.remove(self._ends[stream.name][0]):
                 self._ends[stream.name] = window.add(slow_end(stream.slow, following, value)), value
 
@@ -265,9 +266,9 @@ class States:
             P = propagated_covariance(
                 P, newest, at.T_world_body.rotation().matrix(), (to_ns - from_ns) * 1e-9, pim.preintMeasCov()
             )
-            jump_m, _ = self._jumped(stream, timeline.slow_of[base], timeline.slow_of[k])
-            if stream.slow is not None and size > 6 and jump_m > 0.0:
-                P[6:, 6:] += np.diag(np.where(stream.slow.far_axes, jump_m**2, 0.0))
+            jump, _ = self._jumped(stream, timeline.slow_of[base], timeline.slow_of[k])
+            if stream.slow is not None and size > 6 and jump > 0.0:
+                P[6:, 6:] += np.diag(np.where(stream.slow.jump_axes, jump**2, 0.0))
         return prediction_of(residual, at, P, newest.velocity_cov)
 
     def covariance(self, slow_of: Sequence[LiveStream]) -> Array:

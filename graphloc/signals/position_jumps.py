@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
+from graphloc.signals.level_steps import FEWEST_BESIDE, level_steps
 from graphloc.time import NS_PER_S, duration_ns, utc_text
 
 LASTS_S = 200.0
@@ -35,13 +36,8 @@ _EVEN = 1.5  # steps that last longer or shorter than usual by more than this fa
 _BURST_S = 1.0  # fixes that are off for no longer are outliers
 _FAST_S = 0.25  # time between fixes up to which the motion within a second is even
 # Of `jumps_off_track`, which compares the medians of the fixes on either side of a jump.
-_BESIDE_S = 2.0  # length of either side
-_FEWEST_BESIDE = 3  # fixes on either side, at least, and so many of them off to that side: two outliers are no jump
 _SLOW_S = 2.5  # time between fixes from which two on either side are enough: the track follows after these
-_OFF_SIGMAS = 8.0  # least difference of the two medians, in its sigmas
 _OFF_M = 1.0  # least difference of the two medians
-_AT_ONCE = 0.5  # share of it that must come in one step: for other reasons track and fixes part little by little
-_GAP = 3.0  # a step that lasts so many times the usual one is a gap
 _KEPT = 200  # fixes and jumps kept online, to bound memory: ten seconds of a receiver at 20 Hz; a choice
 _FITS_SIGMAS = 5.0  # off its prediction, up to which the fix before a jump fits
 _CERTAIN_SIGMAS = 8.0  # off its prediction, from which the fix after a jump does not fit
@@ -117,9 +113,9 @@ def _stays(places_m: Array, at: int, off_m: float, usual_s: float) -> bool:
     Two outliers close to each other, with right fixes between them, look like a jump there and another one back by another way. The medians
     of some fixes on either side are compared, less the usual motion between them.
     """
-    n = max(round(_BURST_S / 2.0 / usual_s), _FEWEST_BESIDE)
+    n = max(round(_BURST_S / 2.0 / usual_s), FEWEST_BESIDE)
     before, after = places_m[max(at - n, 0) : at], places_m[at : at + n]
-    if min(len(before), len(after)) < _FEWEST_BESIDE:
+    if min(len(before), len(after)) < FEWEST_BESIDE:
         return True
     steps = np.diff(np.concatenate([before, after]), axis=0)
     moved_m = np.median(steps, axis=0) * (len(before) + len(after)) / 2.0
@@ -137,35 +133,9 @@ def jumps_off_track(stamps_ns: NDArray[np.int64], off_m: Array, *, allowed_m: fl
         allowed_m: size up to which the bounds already include a jump (`build.allowed_jump_m`).
     """
     dt_s = np.diff(stamps_ns) / NS_PER_S
-    usual_s = float(np.median(dt_s)) if len(dt_s) else np.inf
-    fewest = _FEWEST_BESIDE if usual_s < _SLOW_S else 2
-    n = max(fewest, round(_BESIDE_S / max(usual_s, 1e-3)))
-    if len(off_m) < max(2 * n, _FEWEST):
-        return _none()
-    steps = np.diff(off_m, axis=0)
-    windows = np.lib.stride_tricks.sliding_window_view(off_m, n, axis=0)
-    medians = np.median(windows, axis=-1)
-    # For each step that has n fixes on either side.
-    change, between = medians[n:] - medians[:-n], (medians[n:] + medians[:-n]) / 2.0
-    size_m, inner = np.linalg.norm(change, axis=1), slice(n - 1, n - 1 + len(change))
-    after, before = (
-        (np.einsum("kin,ki->kn", own - between[:, :, None], change) * way > 0.0).sum(axis=1)
-        for own, way in ((windows[n:], 1.0), (windows[:-n], -1.0))
-    )
-    # Sigma of a fix on one axis, by the median length of steps; sqrt(pi / n) times it is that of the difference of
-    # medians.
-    sigma_m = float(np.median(np.linalg.norm(steps, axis=1))) / np.sqrt(4.0 * np.log(2.0))
-    least_m = max(_OFF_M, allowed_m, _OFF_SIGMAS * sigma_m * np.sqrt(np.pi / n))
-    along_m = np.einsum("ni,ni->n", steps[inner], change) / np.maximum(size_m, 1e-9)
-    # Across a gap the track bends without a jump, too, if the IMU is worse than configured.
-    jumps = (size_m > least_m) & (along_m > _AT_ONCE * size_m) & (dt_s[inner] < _GAP * usual_s)
-    jumps &= np.minimum(after, before) >= fewest
-    left_m, found = np.where(jumps, size_m, 0.0), list[int]()
-    while left_m.max() > 0.0:
-        found.append(int(np.argmax(left_m)))
-        left_m[max(found[-1] - n + 1, 0) : found[-1] + n] = 0.0
-    at = np.sort(np.array(found, dtype=np.int64))
-    return stamps_ns[at + n], size_m[at]
+    slow = len(dt_s) > 0 and float(np.median(dt_s)) >= _SLOW_S
+    at_ns, changes_m = level_steps(stamps_ns, off_m, max(_OFF_M, allowed_m), fewest=2 if slow else FEWEST_BESIDE)
+    return at_ns, np.linalg.norm(changes_m, axis=1)
 
 
 def _parts(steps_m: Array) -> Array:
@@ -228,6 +198,11 @@ class PositionJump(NamedTuple):
     after_ns: int
     east_m: float
     north_m: float
+
+    @property
+    def parts(self) -> tuple[float, ...]:
+        """The jump in the unit in which the receiver's slow error is written, m."""
+        return self.east_m, self.north_m
 
     @property
     def size_m(self) -> float:

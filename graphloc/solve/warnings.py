@@ -24,6 +24,7 @@ from graphloc.judge.warnings import (
     scale_warning,
     slow_error_warning,
 )
+from graphloc.signals.heading_steps import step_warnings
 from graphloc.signals.position_jumps import jump_warnings, largest_sigma
 from graphloc.solution import CONTRADICTING_COST, Graded, SolveStats
 from graphloc.solve._lasting import lasting
@@ -274,6 +275,7 @@ def _of_a_sensor(stream: Stream, result: BatchResult) -> list[str]:
     warnings += late_far_off(stream.name, stream.slow, late_of(stream, result.values) or 0.0)
     warnings += slow_error_warning(stream.name, stream.left_out, without_height=stream.without_height)
     allowed = stream.left_out is not None
+    warnings += step_warnings(stream.name, stream.heading_steps)
     warnings += jump_warnings(stream.name, *stream.position_jumps, allowed=allowed, followed=stream.slow is None)
     verdicts = [result.verdicts[(stream.number, i)] for i in range(len(stream.measurements))]
     warnings += _lasting_error(stream, verdicts)

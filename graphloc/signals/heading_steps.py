@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Steps of a heading that the gyroscope does not show: iron is moved on board, or a GNSS compass is fixed wrongly.
+
+A compass's error wanders by a degree within a minute. A step of 20 deg from one reading to the next that stays is no such wander:
+taken for one, it draws the heading along, and the gyroscope, which denies it, looks like one whose bias runs away. As an error
+of the gyroscope it would be a turn faster than the craft turns anywhere around.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphloc.frames import Array
+from graphloc.signals.level_steps import beside, level_steps
+from graphloc.time import NS_PER_S, utc_text
+
+_LEAST_RAD = np.radians(5.0)  # smaller steps are noise and wander
+_SIGMAS = 3.0  # least size in stated sigmas of a reading
+# The largest turn within so many seconds is no step: readings may be late by as much, and the turn of a craft that lists is a
+# little more than what the gyroscope across its deck shows.
+_LATE_S = 0.5
+_KEPT = 128  # readings and steps kept online, to bound memory
+
+
+class HeadingStep(NamedTuple):
+    """A step of the headings of a compass.
+
+    Attributes:
+        after_ns: stamp of the first reading after it. size_rad: the headings after it less those before.
+    """
+
+    after_ns: int
+    size_rad: float
+
+    @property
+    def parts(self) -> tuple[float, ...]:
+        """The step in the unit in which the compass's slow error is written, deg."""
+        return (math.degrees(self.size_rad),)
+
+
+def heading_steps(
+    stamps_ns: NDArray[np.int64], yaw_rad: Array, turned_rad: Array, sigma_rad: Array, blind: NDArray[np.bool_]
+) -> list[HeadingStep]:
+    """Return the steps of headings beside a gyroscope. A single outlier, or two, is none.
+
+    Args:
+        stamps_ns: (N,), increasing. yaw_rad: (N,) readings. turned_rad: (N,) by how much the gyroscope has turned about the
+            vertical until each. sigma_rad: (N,) as stated. blind: (N - 1,) intervals in which the gyroscope was silent.
+    """
+    if len(stamps_ns) < 2:
+        return []
+    off, turns = np.unwrap(yaw_rad - turned_rad), np.abs(np.diff(turned_rad))
+    if float(np.ptp(off)) < _LEAST_RAD:
+        return []
+    dt_s = np.diff(stamps_ns) / NS_PER_S
+    around = beside(float(np.median(dt_s)))
+    fastest = _around(np.where(blind, np.inf, turns / np.maximum(dt_s, 1e-3)), around)
+    least = np.maximum(np.maximum(_LEAST_RAD, _LATE_S * fastest), _SIGMAS * _around(sigma_rad[1:], around))
+    at_ns, changes = level_steps(stamps_ns, off[:, None], least)
+    return [HeadingStep(int(n), float(change)) for n, change in zip(at_ns, changes[:, 0], strict=True)]
+
+
+def _around(values: Array, n: int) -> Array:
+    """Return the largest of the n values before each value, itself and the n after it."""
+    padded = np.pad(values, n, constant_values=0.0)
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * n + 1).max(axis=1))
+
+
+def step_warnings(sensor: str, steps: Sequence[HeadingStep]) -> list[str]:
+    """Return a warning on the steps of a compass's headings, or none."""
+    if not steps:
+        return []
+    largest = max(steps, key=lambda step: abs(step.size_rad))
+    others = f", and {len(steps) - 1} more" if len(steps) > 1 else ""
+    size, at = f"{math.degrees(largest.size_rad):+.0f} deg", utc_text(largest.after_ns)
+    said = f"{sensor}: heading step of {size} at {at}{others}, which the gyroscope does not show: taken as its error"
+    return [f"{said} (iron, a wrong fix of a GNSS compass); its mount counts as unknown after it"]
+
+
+class HeadingStepDetector:
+    """Finds the steps of one compass online, a few readings late.
+
+    Attributes:
+        steps: the last of the steps found since the estimate started.
+    """
+
+    def __init__(self) -> None:
+        self.steps: tuple[HeadingStep, ...] = ()
+        self._seen: deque[tuple[int, float, float, float, bool]] = deque(maxlen=_KEPT)
+
+    @property
+    def last_ns(self) -> int | None:
+        """Stamp of the newest reading; None: there is none yet."""
+        return self._seen[-1][0] if self._seen else None
+
+    def note(self, stamp_ns: int, yaw_rad: float, turned_rad: float | None, sigma_rad: float) -> list[HeadingStep]:
+        """Take in a reading, unless it is late, and return new steps.
+
+        Args:
+            turned_rad: turn by the gyroscope about the vertical since the last one; None: not known.
+        """
+        if self._seen and stamp_ns <= self._seen[-1][0]:
+            return []
+        before = self._seen[-1][2] if self._seen else 0.0
+        self._seen.append((stamp_ns, yaw_rad, before + (turned_rad or 0.0), sigma_rad, turned_rad is None))
+        stamps, yaw, turned, sigma, blind = zip(*self._seen, strict=True)
+        found = heading_steps(
+            np.array(stamps, dtype=np.int64), np.array(yaw), np.array(turned), np.array(sigma), np.array(blind[1:])
+        )
+        # The size of a step changes a little with each reading after it, its place by one of them.
+        since_ns = self.steps[-1].after_ns + NS_PER_S if self.steps else -1
+        new = [step for step in found if step.after_ns > since_ns]
+        self.steps = (*self.steps, *new)[-_KEPT:]
+        return new
