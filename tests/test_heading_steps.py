@@ -1,40 +1,110 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A compass that reads 20 deg more from mid-run on, as by iron that is moved on board, does not take the heading along."""
+"""Steps of a compass's headings that the gyroscope does not show: iron that is moved on board, a wrong fix of a GNSS compass."""
 
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from graphloc import app
 from graphloc.config import GnssConfig
 from graphloc.eval.simulate import Scenario, simulate
-from graphloc.frames import wrap_angle
+from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import CompassHeading
 from graphloc.replay import replay
+from graphloc.signals.heading_steps import HeadingStepDetector, heading_steps
 
-AT_S = 45.0
+AT_S, STEP_RAD = 45.0, np.radians(20.0)
+DAMPED = {"at once": 1e-3, "damped": 1.0}  # time constant of the compass's own filter, s
 
 
-@pytest.mark.parametrize("online", [False, True])
-def test_heading_stays(online: bool) -> None:
+@pytest.mark.parametrize("online", [False, True], ids=["offline", "online"])
+@pytest.mark.parametrize("filter_s", DAMPED.values(), ids=DAMPED)
+def test_a_compass_that_steps_does_not_take_the_heading_along(online: bool, filter_s: float) -> None:
     rates: dict[str, Any] = {"imu_hz": 50.0, "gnss_hz": 5.0, "compass_hz": 5.0, "pose_hz": 0.0, "gnss_sigma_m": 0.02}
-    run = simulate(Scenario(path="loops", duration_s=90.0, noise="clean", **rates), seed=523)
+    run = simulate(Scenario(path="loops", duration_s=75.0, noise="clean", **rates), seed=523)
     begin_ns = int(run.truth.stamps_ns[0])
 
     def turned(m: Any) -> Any:
-        late = isinstance(m, CompassHeading) and m.stamp_ns - begin_ns > AT_S * 1e9
-        return replace(m, yaw_rad=float(m.yaw_rad + np.radians(20.0))) if late else m
+        since_s = (m.stamp_ns - begin_ns) * 1e-9 - AT_S
+        if not isinstance(m, CompassHeading) or since_s < 0.0:
+            return m
+        return replace(m, yaw_rad=float(m.yaw_rad + STEP_RAD * -np.expm1(-since_s / filter_s)))
 
     recording = replace(run.recording, measurements=tuple(map(turned, run.recording.measurements)))
     gnss = GnssConfig.model_validate(
         run.config.sensors["gnss"].model_dump() | {"slow_error": {"horizontal_sigma_m": 0.03, "vertical_sigma_m": 0.03}}
     )
     config = run.config.model_copy(update={"sensors": {**run.config.sensors, "gnss": gnss}})
-    track = (replay(recording, config) if online else app.smooth_recording(recording, config)).solution.trajectory
+    solution = (replay(recording, config) if online else app.smooth_recording(recording, config)).solution
+    track = solution.trajectory
     seen = run.truth.covers(track.stamps_ns) & (track.stamps_ns - begin_ns > 20e9)
     off = wrap_angle(track.yaw_rad[seen] - run.truth.at(track.stamps_ns[seen]).yaw_rad)
     assert np.degrees(np.sqrt(np.mean(off**2))) < 1.5
     assert track.cov is not None
     assert np.mean(np.abs(off) < 2.58 * np.sqrt(track.cov[seen, 5, 5])) > 0.95
+    said = (*solution.stats.warnings, *solution.stats.events)
+    assert any("compass: heading step of +" in line and "does not show" in line for line in said)
+    assert not any("its biases change" in line or "sigmas" in line for line in said)  # nothing else is blamed
+
+
+HZ = 5.0
+T = np.arange(0.0, 40.0, 1.0 / HZ)
+TURNING = np.where(np.abs(T - 20.0) < 5.0, np.radians(12.0), 0.0)  # rad/s, from 15 to 25 s
+
+
+def steps(
+    yaw: Array, rate: Array, blind: NDArray[np.bool_] | None = None, online: bool = False
+) -> list[tuple[float, float]]:
+    """Return times, s, and sizes, deg, of the steps of headings `yaw` (N,) beside a gyroscope that shows `rate` (N,)."""
+    noise = np.random.default_rng(3).normal(0.0, np.radians(0.5), len(T))
+    turned, stamps_ns = np.cumsum(rate) / HZ, (T * 1e9).astype(np.int64)
+    unseen: NDArray[np.bool_] = np.zeros(len(T) - 1, dtype=bool) if blind is None else blind
+    if not online:
+        found = heading_steps(stamps_ns, yaw + noise, turned, np.full(len(T), np.radians(1.0)), unseen)
+    else:
+        detector = HeadingStepDetector()
+        for k, stamp_ns in enumerate(stamps_ns.tolist()):
+            known = k > 0 and not unseen[k - 1]
+            detector.note(stamp_ns, float(yaw[k] + noise[k]), rate[k] / HZ if known else None, np.radians(1.0))
+        found = list(detector.steps)
+    return [(step.after_ns * 1e-9, float(np.degrees(step.size_rad))) for step in found]
+
+
+HEADING = np.cumsum(TURNING) / HZ
+
+
+@pytest.mark.parametrize("online", [False, True], ids=["offline", "online"])
+def test_steps_are_found_where_they_are(online: bool) -> None:
+    """One of 20 deg from 8 to 30 s, across a turn, so there and back; with the sign of the headings."""
+    there = 20.0 * ((T >= 8.0) & (T < 30.0))
+    (first, up), (second, down) = steps(HEADING + np.radians(there), TURNING, online=online)
+    assert np.allclose((first, second), (8.0, 30.0))
+    assert abs(up - 20.0) < 1.0
+    assert abs(down + 20.0) < 1.0
+    (found,) = steps(
+        HEADING + np.radians(20.0 * (1.0 - np.exp(-np.maximum(T - 30.0, 0.0) / 0.8))), TURNING, online=online
+    )
+    assert abs(found[0] - 30.5) < 0.75
+
+
+@pytest.mark.parametrize("online", [False, True], ids=["offline", "online"])
+def test_what_is_no_step(online: bool) -> None:
+    late = np.interp(T - 0.4, T, HEADING)
+    assert not steps(late, TURNING, online=online)  # a compass that lags behind while the craft turns
+    assert not steps(
+        HEADING, np.zeros_like(T), online=online
+    )  # a gyroscope that shows nothing of a turn of 12 deg/s for 10 s
+    short = np.where(np.abs(T - 20.0) < 0.65, 0.0, TURNING)
+    assert not steps(HEADING, short, online=online)  # or of a second of it
+    outliers = np.where(np.isin(np.arange(len(T)), [40, 41, 90, 150]), 1.0, 0.0)
+    assert not steps(HEADING + outliers, TURNING, online=online)  # some headings that are 57 deg off
+    assert not steps(
+        HEADING + np.radians(20.0) * np.clip((T - 5.0) / 20.0, 0.0, 1.0), TURNING, online=online
+    )  # a wander
+    stepped = HEADING + np.radians(20.0 * (T >= 8.0))
+    assert steps(stepped, TURNING, online=online)
+    # Where the gyroscope was silent the craft may have turned.
+    assert not steps(stepped, TURNING, blind=np.abs(T[1:] - 8.0) < 0.3, online=online)

@@ -262,19 +262,20 @@ def _step(
 def _jumps_of(problem: Problem, stream: Stream) -> dict[int, float]:
     """Return, by slow node, the size (m, rad) of the jump or step in the measurements from there to the next node.
 
-    It is somewhere between the last measurement before it and the first after it, so each step between these has its
-    size.
+    It is somewhere between the last measurement before it and the first after it, or where it is over, so each step
+    between these has its size.
     """
     found: dict[int, float] = {}
-    seen = [*zip(*stream.position_jumps, strict=True), *((s.after_ns, s.size_rad) for s in stream.heading_steps)]
+    jumps = ((at_ns, at_ns, size_m) for at_ns, size_m in zip(*stream.position_jumps, strict=True))
+    seen = [*jumps, *((step.after_ns, step.until_ns, abs(step.size_rad)) for step in stream.heading_steps)]
     if not seen or not stream.measurements:
         return found
     nodes_ns = problem.timeline.slow_stamps_ns
     stamps_ns = [m.stamp_ns for m in stream.measurements]
-    for at_ns, size in seen:
+    for at_ns, until_ns, size in seen:
         before_ns = stamps_ns[max(int(np.searchsorted(stamps_ns, at_ns)) - 1, 0)]
-        first, last = np.searchsorted(nodes_ns, [before_ns, at_ns], side="right") - 1
-        found |= dict.fromkeys(range(int(first), int(last) + 1), abs(float(size)))
+        first, last = np.searchsorted(nodes_ns, [before_ns, until_ns], side="right") - 1
+        found |= dict.fromkeys(range(int(first), int(last) + 1), float(size))
     return found
 
 

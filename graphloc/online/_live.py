@@ -274,16 +274,16 @@ class LiveStream:
             tape.forget(before)
 
     def jumped(self, after_ns: int, until_ns: int) -> tuple[float, Array | None]:
-        """Return the largest jump (m, rad) with `after_ns` < stamp <= `until_ns`, and the slow error (k,) that all add.
+        """Return the largest jump (m, rad) in `after_ns` < stamp <= `until_ns`, and the slow error (k,) that all add.
 
         0 and None where there is no jump.
         """
-        found = [j for j in self.jumps if after_ns < j.after_ns <= until_ns]
+        found = [j for j in self.jumps if after_ns < j.until_ns and j.after_ns <= until_ns]
         if self.slow is None or not found or not self.slow.jump_axes.any():
             return 0.0, None
         moved, step = self.slow.jump_axes, np.zeros(len(self.slow.axes))
         added = np.array([j.parts for j in found]) / self.slow.scale[moved]
-        step[moved] = added.sum(axis=0)
+        step[moved] = added[[j.after_ns > after_ns for j in found]].sum(axis=0)
         return float(np.linalg.norm(added, axis=1).max()), step
 
 

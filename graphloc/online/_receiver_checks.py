@@ -17,7 +17,7 @@ from graphloc.online._agreement import Agreement
 from graphloc.online._entries import Entries
 from graphloc.online._frozen_receiver import WINDOW_S
 from graphloc.online._live import LiveProblem, LiveStream
-from graphloc.online._states import States
+from graphloc.online._states import States, silent_within
 from graphloc.signals.frozen_receiver import FROZEN, FROZEN_VELOCITY
 from graphloc.signals.heading_steps import step_warnings
 from graphloc.signals.position_jumps import (
@@ -141,11 +141,10 @@ class ReceiverChecks:
     def _check_heading(self, stream: LiveStream, stamp_ns: int, at: Attachment, hint: Hint) -> None:
         """Look for a step of the headings that the gyroscope does not show; the window is rebuilt with it."""
         detector, links = stream.receiver.heading, self._problem.links
-        last_ns, turned_rad = detector.last_ns, None
-        if last_ns is not None and self._problem.timeline.stamps_ns[self._problem.timeline.first] <= last_ns < stamp_ns:
-            if not any(begin_ns < stamp_ns and end_ns > last_ns for begin_ns, end_ns in links.gaps()):
-                turn = links.integrate(last_ns, stamp_ns, self._states.newest.bias).deltaRij()
-                turned_rad = float(gtsam.Rot3.Logmap(turn) @ at.T_world_body.rotation().matrix()[2])
+        first_ns, last_ns, turned_rad = self._problem.timeline.stamps_ns.kept[0], detector.last_ns, None
+        if last_ns is not None and first_ns <= last_ns < stamp_ns and not silent_within(links, last_ns, stamp_ns):
+            turn = links.integrate(last_ns, stamp_ns, self._states.newest.bias).deltaRij()
+            turned_rad = float(gtsam.Rot3.Logmap(turn) @ at.T_world_body.rotation().matrix()[2])
         found = detector.note(stamp_ns, hint.yaw_rad, turned_rad, hint.yaw_sigma_rad)
         self._warnings += step_warnings(stream.name, found)
 

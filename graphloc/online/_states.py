@@ -59,7 +59,12 @@ class Newest:
 
 def hole_within(links: InertialLink, begin_ns: int, end_ns: int) -> bool:
     """Return whether the IMU is silent for long in an interval: it is then unknown how the body has turned."""
-    return any(a < end_ns and b > begin_ns and b - a > _HOLE_S * NS_PER_S for a, b in links.gaps())
+    return silent_within(links, begin_ns, end_ns, _HOLE_S)
+
+
+def silent_within(links: InertialLink, begin_ns: int, end_ns: int, longer_s: float = 0.0) -> bool:
+    """Return whether an interval overlaps a gap of the IMU, or one that is longer than so many seconds."""
+    return any(a < end_ns and b > begin_ns and b - a > longer_s * NS_PER_S for a, b in links.gaps())
 
 
 def propagated_covariance(cov: Array, newest: Newest, R: Array, dt_s: float, noise: Array) -> Array:

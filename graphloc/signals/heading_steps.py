@@ -17,14 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.signals.level_steps import beside, level_steps
-from graphloc.time import NS_PER_S, utc_text
+from graphloc.signals.level_steps import BESIDE_S, Shape, beside, level_steps
+from graphloc.time import NS_PER_S, duration_ns, utc_text
 
 _LEAST_RAD = np.radians(5.0)  # smaller steps are noise and wander
 _SIGMAS = 3.0  # least size in stated sigmas of a reading
 # The largest turn within so many seconds is no step: readings may be late by as much, and the turn of a craft that lists is a
 # little more than what the gyroscope across its deck shows.
 _LATE_S = 0.5
+_SETTLES_S = 2.0  # time after a step within which it is over, also in a compass that filters its headings
+# At once; or in a compass that filters its headings, of which less than 0.46 would come within `_DAMPED_S` where a turn ends that the
+# gyroscope does not show.
+_AT_ONCE, _DAMPED = Shape(sure=2.0, before=0.3, after=0.3), Shape(share=0.5, sure=1.0, before=0.25, after=0.65)
+_DAMPED_S = 0.6
+# A step is faster than all turns around it by this factor: a gyroscope that shows nothing of a turn, or less, looks like a step.
+_FASTER = 2.5
 _KEPT = 128  # readings and steps kept online, to bound memory
 
 
@@ -43,6 +50,11 @@ class HeadingStep(NamedTuple):
         """The step in the unit in which the compass's slow error is written, deg."""
         return (math.degrees(self.size_rad),)
 
+    @property
+    def until_ns(self) -> int:
+        """Stamp until which the headings may still settle at their new level."""
+        return self.after_ns + duration_ns(_SETTLES_S)
+
 
 def heading_steps(
     stamps_ns: NDArray[np.int64], yaw_rad: Array, turned_rad: Array, sigma_rad: Array, blind: NDArray[np.bool_]
@@ -59,11 +71,19 @@ def heading_steps(
     if float(np.ptp(off)) < _LEAST_RAD:
         return []
     dt_s = np.diff(stamps_ns) / NS_PER_S
-    around = beside(float(np.median(dt_s)))
+    usual_s = float(np.median(dt_s))
+    around = beside(usual_s)
     fastest = _around(np.where(blind, np.inf, turns / np.maximum(dt_s, 1e-3)), around)
-    least = np.maximum(np.maximum(_LEAST_RAD, _LATE_S * fastest), _SIGMAS * _around(sigma_rad[1:], around))
-    at_ns, changes = level_steps(stamps_ns, off[:, None], least)
-    return [HeadingStep(int(n), float(change)) for n, change in zip(at_ns, changes[:, 0], strict=True)]
+    least = np.maximum(_LEAST_RAD, _SIGMAS * _around(sigma_rad[1:], around))
+    found: dict[int, float] = {}
+    several = round(_DAMPED_S / max(usual_s, 1e-3))
+    for shape in (_AT_ONCE, _DAMPED._replace(within=several - (several + 1) % 2)):
+        if shape.within > 0:
+            faster = np.maximum(least, max(_LATE_S, _FASTER * shape.within * usual_s) * fastest)
+            at_ns, changes = level_steps(stamps_ns, off[:, None], faster, shape=shape)
+            new = (np.abs(np.subtract.outer(at_ns, [*found])) > BESIDE_S * NS_PER_S).all(axis=1)
+            found |= zip(at_ns[new].tolist(), changes[new, 0].tolist(), strict=True)
+    return [HeadingStep(*step) for step in sorted(found.items())]
 
 
 def _around(values: Array, n: int) -> Array:
@@ -84,7 +104,7 @@ def step_warnings(sensor: str, steps: Sequence[HeadingStep]) -> list[str]:
 
 
 class HeadingStepDetector:
-    """Finds the steps of one compass online, a few readings late.
+    """Finds the steps of one compass online, three seconds late.
 
     Attributes:
         steps: the last of the steps found since the estimate started.
@@ -115,6 +135,7 @@ class HeadingStepDetector:
         )
         # The size of a step changes a little with each reading after it, its place by one of them.
         since_ns = self.steps[-1].after_ns + NS_PER_S if self.steps else -1
-        new = [step for step in found if step.after_ns > since_ns]
+        until_ns = stamp_ns - duration_ns(BESIDE_S + _DAMPED_S)  # of a later one it is not yet clear where it begins
+        new = [step for step in found if since_ns < step.after_ns <= until_ns]
         self.steps = (*self.steps, *new)[-_KEPT:]
         return new

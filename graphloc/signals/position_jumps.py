@@ -205,6 +205,11 @@ class PositionJump(NamedTuple):
         return self.east_m, self.north_m
 
     @property
+    def until_ns(self) -> int:
+        """Stamp at which it is over."""
+        return self.after_ns
+
+    @property
     def size_m(self) -> float:
         """Length of the jump, m."""
         return math.hypot(self.east_m, self.north_m)
