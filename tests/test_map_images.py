@@ -15,8 +15,9 @@ from pyproj import CRS
 
 from graphloc.config import AerialConfig
 from graphloc.errors import InputError
-from graphloc.frames import Datum, Geodetic
+from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends.aerial.image import AerialImage
+from graphloc.frontends.aerial.layers import find_edges
 from graphloc.frontends.aerial.maps import Map
 from graphloc.frontends.aerial.scan import Outline
 from tests.mapfactory import BRIGHT, DARK, NEW_YORK, SWEDEN, Bytes, around, check, colours, drawn, framed, utm, write
@@ -76,13 +77,15 @@ def test_pixels_of_every_kind(tmp_path: Path) -> None:
     check(around(utm(tmp_path / "grey.tif", lambda g: g[None])))
     check(around(utm(tmp_path / "two.tif", lambda g: np.stack([g, np.full_like(g, 255)]))))
     turned = utm(
-        tmp_path / "bgr.tif", lambda g: np.stack([np.full_like(g, 9), g, 255 - g, g]), photometric="MINISBLACK"
+        tmp_path / "bgr.tif",
+        lambda g: np.stack([np.full_like(g, 9), g, (0.75 * g).astype(np.uint8), g]),
+        photometric="MINISBLACK",
     )
     with rasterio.open(turned, "r+") as f:
         f.colorinterp = [rasterio.enums.ColorInterp[c] for c in ("undefined", "blue", "green", "red")]
     patch = around(turned)
     check(patch)
-    check(patch, 255 - BRIGHT, 255 - DARK, band=1)
+    check(patch, 0.75 * BRIGHT, 0.75 * DARK, band=1)
     with pytest.raises(InputError, match=r"c\.tif: no picture in it"):
         around(utm(tmp_path / "c.tif", lambda g: g[None].astype(np.complex64)))
 
@@ -102,16 +105,35 @@ def test_a_palette_is_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize(("kind", "scale"), [("uint16", 12.0), ("int16", 100.0), ("float32", 0.004)])
 def test_deep_pixels_are_stretched(kind: str, scale: float, tmp_path: Path) -> None:
-    """The bright thing is 330 of 19600 m^2: a second one of the same colour makes 2 % of it, and 98 % the bright."""
+    """To a contrast of 120 from 36 on. The bright thing is small; a second one of the same colour makes 98 % the bright."""
 
     def deep(grey: Bytes) -> NDArray[Any]:
         grey[-60:] = BRIGHT
         return np.asarray(colours(grey) * scale).astype(kind)
 
     path = utm(tmp_path / "a.tif", deep)
-    check(around(path), 255, 0)
+    check(around(path), 156, 36)
     known = utm(tmp_path / "b.tif", lambda g: np.where(np.arange(g.shape[1]) > 50, deep(g), -9 if kind != "uint16" else 0).astype(kind), nodata=0 if kind == "uint16" else -9)  # fmt: skip
-    check(around(known), 255, 0)  # what is no data does not count
+    check(around(known), 156, 36)  # what is no data does not count
+
+
+@pytest.mark.parametrize(("brightness", "contrast"), [(0.0, 0.25), (170.0, 0.3), (-20.0, 1.5), (20.0, 0.8), (0.0, 1.0)])
+def test_the_edges_found_are_those_of_a_usual_contrast(brightness: float, contrast: float, tmp_path: Path) -> None:
+    """A dark, a hazy and a harsh picture have the edges of a good one."""
+    rng = np.random.default_rng(1)
+    fields = np.kron(rng.choice([20.0, 85.0, 150.0], (12, 12)), np.ones((50, 50)))
+    picture = fields + rng.normal(0.0, 2.0, fields.shape)
+
+    def edges(name: str, pixels: Array) -> NDArray[np.bool_]:
+        path = utm(
+            tmp_path / name,
+            lambda g: colours(np.clip(pixels, 0, 255).round().astype(np.uint8)[: g.shape[0], : g.shape[1]]),
+        )
+        return find_edges(around(path, cell_m=0.25)).where
+
+    usual, found = edges("usual.tif", picture), edges("a.tif", np.asarray(brightness + contrast * picture))
+    assert usual.sum() > 1000
+    assert (usual != found).sum() < 0.15 * usual.sum()
 
 
 def test_no_data_is_reported_in_many_ways(tmp_path: Path) -> None:

@@ -31,6 +31,12 @@ Pixels = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 _NET_M = 8.0
 _SAMPLES, _SAMPLE_PX = 8, 128
+_GREY = np.array([0.299, 0.587, 0.114])  # of red, green and blue, as edges are found in
+_ENDS = [2.0, 98.0]  # percentiles
+_NOTHING = 10.0  # contrast of 8 bits below which there is nothing to see but a few small things
+# Contrasts between which the edges found are much the same, and one amid them; what becomes of the darkest (2 %) of an image that is
+# stretched. The brightest (98 %) then leave room for roofs that are brighter still.
+_CONTRASTS, _CONTRAST, _DARKEST = (80.0, 165.0), 120.0, 36.0
 _WKT_CHARS = 100_000
 _PALETTE_PX = 300_000_000  # most pixels that are read at once of an image with a palette, which cannot be read coarser
 
@@ -65,8 +71,8 @@ class AerialImage:
     webp: its deepest zoom level, see `tiles.describe_tiles`.
 
     One band is grey; a palette is expanded; of more bands, the ones named red, green, blue are taken, else the first
-    three. Pixels of more than 8 bits are stretched: the 2 % and 98 % points of samples over the whole image become 0
-    and 255, for all bands alike. There is no data where an alpha band, a mask or a nodata value says so, and where a
+    three. An image of unusual contrast (hazy, dark, harsh, of more than 8 bits) is stretched, all bands alike, as the edges
+    found depend on it (`_stretch`). There is no data where an alpha band, a mask or a nodata value says so, and where a
     tile is missing.
 
     Raises:
@@ -85,9 +91,7 @@ class AerialImage:
         named = [bands.get(c, 0) for c in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
         self._bands = named if all(named) else [1, 2, 3] if source.count >= 3 else [1]
         self._palette = _palette_of(source) if ColorInterp.palette in bands else None
-        self._darkest, self._brightest = 0.0, 255.0
-        if self._palette is None and source.dtypes[0] != "uint8":
-            self._darkest, self._brightest = self._span()
+        self._darkest, self._brightest = (0.0, 255.0) if self._palette is not None else self._stretch()
 
     def patch(self, centre_m: Array, half_m: float, cell_m: float) -> Patch:
         """Return the square with half side `half_m` around a point (2,) in world, in cells of `cell_m`.
@@ -175,17 +179,31 @@ class AerialImage:
         if self._palette is not None:
             colours = self._palette[bands[0]]
             return np.ascontiguousarray(colours[..., :3]), has * (colours[..., 3] > 0)
-        if bands.dtype != np.uint8:
+        if (self._darkest, self._brightest) != (0.0, 255.0) or bands.dtype != np.uint8:
             has *= np.isfinite(bands).all(axis=0)
             bright = (np.nan_to_num(bands.astype(np.float32)) - self._darkest) / (self._brightest - self._darkest)
             bands = np.rint(255.0 * np.clip(bright, 0.0, 1.0)).astype(np.uint8)
         return np.ascontiguousarray(np.moveaxis(np.broadcast_to(bands, (3, rows, columns)), 0, 2)), has
 
+    def _stretch(self) -> tuple[float, float]:
+        """Return the values that become 0 and 255.
+
+        Contrast is the range from the 2 % to the 98 % point where there is most to see: elsewhere may be water alone. An image
+        of 8 bits keeps its own, unless it is unusual.
+        """
+        darkest, brightest = self._span()
+        contrast = brightest - darkest
+        usual = _CONTRASTS[0] <= contrast <= _CONTRASTS[1]
+        if self._source.dtypes[0] == "uint8" and (usual or contrast < _NOTHING):
+            return 0.0, 255.0
+        step = contrast / _CONTRAST
+        return darkest - _DARKEST * step, darkest + (255.0 - _DARKEST) * step
+
     def _span(self) -> tuple[float, float]:
-        """Return the 2 % and 98 % quantiles of samples over the image."""
+        """Return the 2 % and 98 % points, in grey, of the quarter of the samples over the image that have the widest range."""
         size = np.array([self._source.width, self._source.height])
         least = np.minimum(size, _SAMPLE_PX)
-        found = [np.zeros(0)]
+        found = list[Array]()
         for u, v in np.ndindex(_SAMPLES, _SAMPLES):
             corner = ((size - least) * np.array([u, v]) / (_SAMPLES - 1)).astype(int)
             window = rasterio.windows.Window(*corner, *least)
@@ -194,9 +212,13 @@ class AerialImage:
                 known = self._source.dataset_mask(window=window) > 127
             except rasterio.errors.RasterioError as error:
                 raise InputError(f"{self._path}: a part of it cannot be read ({_line(error)})") from None
-            found.append(bands[:, known & np.isfinite(bands).all(axis=0)].ravel())
-        values = np.concatenate(found)
-        darkest, brightest = np.percentile(values, [2.0, 98.0]) if len(values) else (0.0, 1.0)
+            values = bands[:, known & np.isfinite(bands).all(axis=0)].astype(np.float64)
+            values = _GREY @ values if len(values) == 3 else values[0]
+            if len(values):
+                found.append(values)
+        found.sort(key=lambda values: float(np.ptp(np.percentile(values, _ENDS))))
+        most = found[3 * len(found) // 4 :]
+        darkest, brightest = np.percentile(np.concatenate(most), _ENDS) if most else (0.0, 1.0)
         return float(darkest), float(max(brightest, darkest + 1e-9))
 
 
