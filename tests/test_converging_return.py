@@ -27,7 +27,7 @@ def run() -> SimulatedRun:
         path="loops", noise="clean", duration_s=130.0, outage_s=_OUTAGE_S, pose_hz=0.0, gnss_hz=1.0, compass_hz=1.0,
         gnss_sigma_m=1.0, imu_hz=50.0,
     )  # fmt: skip
-    return simulate_slowly(scenario, 1)
+    return simulate_slowly(scenario, 1, 1.25)
 
 
 def _error_m(run: SimulatedRun, m: GnssPosition, off_m: float) -> float:
