@@ -159,7 +159,7 @@ def _guess(seed: int) -> Guess:
 
 @pytest.fixture(scope="module")
 def guesses() -> list[Guess]:
-    return [_guess(seed) for seed in range(4)]
+    return [_guess(seed) for seed in range(3)]
 
 
 def test_straight_on_the_heading_is_a_guess(guesses: list[Guess]) -> None:
@@ -212,9 +212,9 @@ def test_a_rest_without_a_heading_sensor_is_soon_settled() -> None:
 
 
 def test_what_comes_after_the_first_window_tells_the_heading(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Straight on for longer than headings are compared, here 50 s instead of 600: no guess any more once it has turned."""
-    monkeypatch.setattr(_start, "_LONGEST_UNTOLD_S", 50.0)
-    recording, config, t, yaw = robot(0, 120.0, 80.0, 95.0, 105.0, speed_mps=8.0, rate_hz=1.25)
+    """Straight on for longer than headings are compared, here 25 s instead of 600: no guess any more once it has turned."""
+    monkeypatch.setattr(_start, "_LONGEST_UNTOLD_S", 25.0)
+    recording, config, t, yaw = robot(0, 65.0, 40.0, 48.0, 56.0, speed_mps=8.0, rate_hz=0.625)
     solved = app.smooth_recording(recording, config).solution
     error, sigma = errors(solved, recording, t, yaw)
     assert sigma[0] > 30.0

@@ -32,7 +32,7 @@ from graphloc.solve import _first_solution
 from graphloc.solve._start import Begun
 from tests import test_online_faults as faults
 from tests.faults import Arrivals, Fed, arrivals_of, complaints, feed, finish
-from tests.slowly import slowly
+from tests.slowly import slowly, sparsely
 from tests.test_online_faults import at_s
 
 S = 1_000_000_000
@@ -71,7 +71,7 @@ def blamed(fed: Fed) -> int:
     return sum("contradicts the other sensors, which agree" in event for event in fed.events)
 
 
-@pytest.mark.parametrize("change", [in_degrees, axes_swapped, biased])
+@pytest.mark.parametrize("change", [in_degrees, biased])
 def test_an_imu_that_goes_wrong_is_left_out_until_it_is_right_again(change: Change) -> None:
     arrivals = changed(change)
     online, fed = begun(12.0)
@@ -110,7 +110,7 @@ def both_off(m: Measurement) -> Measurement:
     return fixes_off(compass_off(m))
 
 
-@pytest.mark.parametrize("change", [compass_off, compass_turns, fixes_off, both_off])
+@pytest.mark.parametrize("change", [compass_turns, fixes_off, both_off])
 def test_sensors_that_no_motion_explains_are_not_believed_against_the_imu(change: Change) -> None:
     arrivals = changed(change)
     online, fed = begun(12.0)
@@ -133,10 +133,10 @@ def test_it_is_left_out_only_where_a_motion_of_a_vessel_explains_the_denials(
 
 
 def smoothed(
-    change: Change, from_s: float = 12.0, until_s: float = 16.0, rate_hz: float = 1.25, length_s: float = 26.0
+    change: Change, from_s: float = 12.0, until_s: float = 16.0, rate_hz: float = 0.625, length_s: float = 20.0
 ) -> tuple[Solution, Recording, TrackErrors]:
     """The same offline."""
-    run = slowly(run_of(length_s=length_s), rate_hz)
+    run = sparsely(slowly(run_of(length_s=length_s), rate_hz), 2)
     samples = [a.m for a in changed(change, from_s, until_s, length_s) if isinstance(a.m, ImuSample)]
     assert run.recording.imu is not None
     imu = replace(
@@ -153,7 +153,7 @@ def smoothed(
 
 @pytest.mark.parametrize("change", [axes_swapped, in_g])
 def test_offline_it_is_left_out_where_it_is_wrong(change: Change) -> None:
-    solution, recording, off = smoothed(change)
+    solution, recording, off = smoothed(change, rate_hz=1.25, length_s=26.0)
     assert np.linalg.norm(off.position_m[:, :2], axis=1).max() < 1.0
     assert np.abs(off.heading_rad).max() < np.radians(8.0)
     (said,) = (w for w in solution.stats.warnings if "contradicts the other sensors, which agree" in w)
@@ -168,7 +168,7 @@ def test_offline_it_is_left_out_where_it_is_wrong(change: Change) -> None:
 
 def test_offline_it_is_found_in_the_first_window() -> None:
     """Aligned to rates that are wrong there, the run ended 122 m and 180 deg off, and took 15 times as long."""
-    solution, _, off = smoothed(in_degrees, 6.0, 9.0, rate_hz=0.625, length_s=16.0)
+    solution, _, off = smoothed(in_degrees, 6.0, 9.0, length_s=14.0)
     assert np.linalg.norm(off.position_m[:, :2], axis=1).max() < 1.0
     assert np.abs(off.heading_rad).max() < np.radians(8.0)
     assert any("contradicts the other sensors, which agree" in w for w in solution.stats.warnings)
@@ -212,7 +212,7 @@ def test_offline_the_start_is_in_doubt_only_where_it_contradicts_itself(
 
 def test_offline_a_gyroscope_that_warms_up_is_not_left_out_but_its_bias_walks_faster() -> None:
     """From 1.5 deg/s, by half in a minute: samples of most of the run were left out."""
-    run = slowly(run_of(length_s=75.0), 1.25)
+    run = sparsely(slowly(run_of(length_s=75.0), 1.25))
     imu = run.recording.imu
     assert imu is not None
     t_s = (imu.stamps_ns - imu.stamps_ns[0]) / S
@@ -228,7 +228,7 @@ def test_offline_a_gyroscope_that_warms_up_is_not_left_out_but_its_bias_walks_fa
 
 @pytest.mark.parametrize("change", [compass_turns, both_off])
 def test_offline_it_is_not_blamed_for_others(change: Change) -> None:
-    solution, *_ = smoothed(change, until_s=22.0)
+    solution, *_ = smoothed(change, until_s=18.0)
     assert not any("contradicts the other sensors, which agree" in w for w in solution.stats.warnings)
 
 

@@ -37,7 +37,7 @@ WAVE_S, WAVE_RAD = 3.0, 0.03
 
 
 def boat(make: Messages, yaw_deg: float, scatter_m: float = 0.3) -> list[Item]:
-    """At 1.2 m/s in waves, turning to and fro; an IMU at 50 Hz turned by `yaw_deg`, fixes at 5 Hz that scatter by `scatter_m`.
+    """At 1.2 m/s in waves, turning to and fro; an IMU at 25 Hz turned by `yaw_deg`, fixes at 5 Hz that scatter by `scatter_m`.
 
     Waves of 0.03 rad put 0.3 m/s^2 of gravity into the horizontal accelerations; the turns are worth 0.12 m/s^2.
     """
@@ -58,7 +58,8 @@ def boat(make: Messages, yaw_deg: float, scatter_m: float = 0.3) -> list[Item]:
     items: list[Item] = []
     for k in range(len(t)):
         stamp = START_NS + k * S // 50
-        items.append(("/imu", stamp, make.imu(stamp, R.T @ accel[k], R.T @ gyro[k])))
+        if k % 2 == 0:
+            items.append(("/imu", stamp, make.imu(stamp, R.T @ accel[k], R.T @ gyro[k])))
         if k % 10 == 0:
             items.append(("/fix", stamp, make.fix(stamp, *lla[k])))
     return items
@@ -88,7 +89,8 @@ def test_the_second_between_ahead_and_astern_is_no_standstill(tmp_path: Path) ->
     lla = DATUM.geodetic_from_enu(np.column_stack([way.real, way.imag, 0.0 * t]))
     for k in range(len(t)):
         at = START_NS + k * S // 50
-        items.append(("/imu", at, make.imu(at, (-0.1, speed[k] * 0.01, G), (0.001 * (k % 3), 0.0, 0.01))))
+        if k % 2 == 0:
+            items.append(("/imu", at, make.imu(at, (-0.1, speed[k] * 0.01, G), (0.001 * (k % 3), 0.0, 0.01))))
         if k % 10 == 0:
             items.append(("/fix", at, make.fix(at, *lla[k])))
             items.append(("/wheel/odom", at, make.odometry(at, v=(speed[k], 0, 0))))
@@ -164,7 +166,8 @@ def swaying(make: Messages, yaw_deg: float, sway_m: float) -> list[Item]:
     for k in range(len(t)):
         stamp = START_NS + k * S // 50
         accel = R.T @ [felt[k].real, felt[k].imag, 9.81]
-        items.append(("/imu", stamp, make.imu(stamp, accel, R.T @ [0.0, 0.0, rate[k]])))
+        if k % 2 == 0:
+            items.append(("/imu", stamp, make.imu(stamp, accel, R.T @ [0.0, 0.0, rate[k]])))
         if k % 10 == 0:
             items.append(("/fix", stamp, make.fix(stamp, *lla[k])))
     return items
@@ -209,7 +212,8 @@ def crossing(make: Messages, legs_s: float) -> list[Item]:
     items: list[Item] = []
     for k in range(len(t)):
         stamp = START_NS + k * S // 50
-        items.append(("/imu", stamp, make.imu(stamp, accel[k], (0.0, 0.0, rate[k]))))
+        if k % 2 == 0:
+            items.append(("/imu", stamp, make.imu(stamp, accel[k], (0.0, 0.0, rate[k]))))
         if k % 10 == 0:
             items.append(("/fix", stamp, make.fix(stamp, *lla[k])))
             items.append(
@@ -513,7 +517,8 @@ def test_a_late_compass_is_drafted_with_its_time_offset(late_s: float, own_clock
     items: list[Item] = []
     for k in range(len(t)):
         at = START_NS + k * S // 50
-        items.append(("/imu", at, make.imu(at, (0.0, 3.0 * rate[k], G), (0.0, 0.0, rate[k] + 1e-3 * rng.normal()))))
+        if k % 2 == 0:
+            items.append(("/imu", at, make.imu(at, (0.0, 3.0 * rate[k], G), (0.0, 0.0, rate[k] + 1e-3 * rng.normal()))))
         if k % 10 == 0:
             half = 0.5 * (yaw[k] + np.radians(0.5) * rng.normal())
             late = at + round(late_s * S)
@@ -632,7 +637,8 @@ def to_and_fro(make: Messages, turned_deg: float = 0.0, topic: str = "/compass",
     items: list[Item] = []
     for k, felt in enumerate((accel @ R).tolist()):
         at = START_NS + k * S // 50
-        items.append(("/imu", at, make.imu(at, felt, (0.0, 0.0, rate[k] + 1e-3 * rng.normal()))))
+        if k % 2 == 0:
+            items.append(("/imu", at, make.imu(at, felt, (0.0, 0.0, rate[k] + 1e-3 * rng.normal()))))
         if k % 10 == 0:
             half = (yaw[k] + np.radians(off_deg)) / 2.0
             items.append(("/fix", at, make.fix(at, lla[k][0], lla[k][1], lla[k][2], 0, 0.25 * np.eye(3).ravel())))
@@ -1220,7 +1226,7 @@ def test_the_unit_of_a_robot_that_pivots_is_told_by_its_attitude(scale: float, t
     assert any("looks like deg/s" in w for w in warned)
 
 
-@pytest.mark.parametrize("every", [1, 50])
+@pytest.mark.parametrize("every", [1, 25])
 def test_an_imu_that_is_too_slow_is_said(every: int, tmp_path: Path) -> None:
     """A logger that keeps one message a second: offline the antenna was 31 m from its mount, online it waited for IMU data, with no word why."""
     make = Messages(2)
@@ -1229,10 +1235,10 @@ def test_an_imu_that_is_too_slow_is_said(every: int, tmp_path: Path) -> None:
     items = sorted([*imu, *(item for item in plain if item[0] != "/imu")], key=lambda item: item[1])
     found, config, _ = look(tmp_path, items, make)
     said = "its samples come 1.0 s apart, more than max_gap_s (0.5 s): each interval is a gap"
-    assert (said in render(found)) == (every == 50)
+    assert (said in render(found)) == (every == 25)
     recording = read_recording(tmp_path / "run", config)
-    assert [said in w for w in recording.warnings if "apart" in w] == [True] * (every == 50)
-    if every == 50:
+    assert [said in w for w in recording.warnings if "apart" in w] == [True] * (every == 25)
+    if every == 25:
         with pytest.raises(
             SolveError, match=r"waiting for 5 s of IMU data, whose samples come 1\.0 s apart, more than"
         ):
@@ -1297,7 +1303,8 @@ def in_a_hall(make: Messages, yaw_deg: float, of: Callable[[int, list[float], li
     items: list[Item] = []
     for k in range(len(t)):
         at = START_NS + k * S // 50
-        items.append(("/imu", at, make.imu(at, M.T @ felt[k], M.T @ rate[k])))
+        if k % 2 == 0:
+            items.append(("/imu", at, make.imu(at, M.T @ felt[k], M.T @ rate[k])))
         if k % 2 == 0:
             items.append(("/hall/craft", at, of(at, place[k].tolist(), R[k].as_quat().tolist())))
     return items
@@ -1346,7 +1353,8 @@ def test_a_heading_of_late_messages_is_as_late_as_the_place_in_them(heading: str
     items: list[Item] = []
     for k in range(len(t)):
         at = START_NS + k * S // 50
-        items.append(("/imu", at, make.imu(at, accel[k], (0.0, 0.0, rate[k] + 1e-3 * rng.normal()))))
+        if k % 2 == 0:
+            items.append(("/imu", at, make.imu(at, accel[k], (0.0, 0.0, rate[k] + 1e-3 * rng.normal()))))
         if k % 10 == 0:
             late = at + round(late_s * S)
             told = yaw[min(k + round(50 * late_s), len(t) - 1) if turning else k] + np.radians(1.0) * rng.normal()

@@ -99,9 +99,7 @@ def test_samples_that_are_sent_again_set_no_clock_back() -> None:
     assert all(taken.dropped and not taken.set_back_s for taken in backwards)
 
 
-@pytest.mark.parametrize(
-    ("rate_hz", "batch", "sigma_ms"), [(1000, 50, 5.0), (1000, 100, 8.0), (400, 40, 10.0), (200, 20, 20.0)]
-)
+@pytest.mark.parametrize(("rate_hz", "batch", "sigma_ms"), [(1000, 100, 8.0), (400, 40, 10.0), (200, 20, 20.0)])
 def test_batches_that_overlap_set_no_clock_back(rate_hz: int, batch: int, sigma_ms: float) -> None:
     """A driver reads a buffer when it comes to it, and stamps its samples back from then on."""
     rng, intake = np.random.default_rng(0), ImuIntake(0.5, floats=True)

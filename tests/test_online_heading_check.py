@@ -84,23 +84,19 @@ def test_nothing_is_reported_of_a_craft_that_goes_astern(run: SimulatedRun) -> N
     assert not any("heading is off" in line for line in found.solution.stats.events)
 
 
-@pytest.mark.parametrize("overturned", [False, True])
-def test_nothing_is_reported_of_a_gyroscope_with_a_bias(overturned: bool) -> None:
-    """By 0.02 rad/s about the vertical, as cheap ones have: carried on raw, it turned what is felt by 28 deg."""
+def test_nothing_is_reported_of_a_gyroscope_with_a_bias() -> None:
+    """By 0.02 rad/s about the vertical, as cheap ones have, on its back: carried on raw, it turned what is felt by 28 deg."""
     scenario = replace(bl_scenario(1, "clean"), duration_s=70.0, pose_hz=0.0, imu_hz=50.0, gnss_hz=5.0, compass_hz=5.0)
     run = sparsely(simulate(scenario, 4), 2)
     imu = run.recording.imu
     assert imu is not None
     biased, config = replace(imu, gyro_radps=imu.gyro_radps + np.array([0.0, 0.0, 0.02])), run.config
-    if overturned:  # the same IMU, on its back
-        back = np.diag([1.0, -1.0, -1.0])
-        biased = replace(biased, accel_mps2=biased.accel_mps2 @ back, gyro_radps=biased.gyro_radps @ back)
-        of_imu = config.sensors["imu"]
-        roll, pitch, yaw = rpy_from_rotation(of_imu.mount.R_body_sensor @ back) * 180.0 / np.pi
-        mount = of_imu.mount.model_copy(update={"rpy_deg": (roll, pitch, yaw)})
-        config = config.model_copy(
-            update={"sensors": config.sensors | {"imu": of_imu.model_copy(update={"mount": mount})}}
-        )
+    back = np.diag([1.0, -1.0, -1.0])
+    biased = replace(biased, accel_mps2=biased.accel_mps2 @ back, gyro_radps=biased.gyro_radps @ back)
+    of_imu = config.sensors["imu"]
+    roll, pitch, yaw = rpy_from_rotation(of_imu.mount.R_body_sensor @ back) * 180.0 / np.pi
+    mount = of_imu.mount.model_copy(update={"rpy_deg": (roll, pitch, yaw)})
+    config = config.model_copy(update={"sensors": config.sensors | {"imu": of_imu.model_copy(update={"mount": mount})}})
     found = replayed(replace(run.recording, imu=biased), config)
     assert not any("heading is off" in line for line in found.solution.stats.events)
     track = found.solution.trajectory

@@ -86,7 +86,7 @@ def test_stamps_that_are_ahead_from_the_start_are_told() -> None:
     assert sum("gnss: its stamps are 18.0 s ahead of the IMU's" in e for e in fed.events) == 1
 
 
-@pytest.mark.parametrize("by_s", [18.0, 3.0, -3.0])
+@pytest.mark.parametrize("by_s", [18.0, -3.0])
 def test_an_estimate_that_wrong_stamps_have_misled_starts_anew(by_s: float) -> None:
     """Fixes that came before the clock became right are put right, too: those 18 s ahead would wait so long for the IMU."""
     begin_ns = arrivals_of(run_of())[0].true_ns

@@ -126,7 +126,7 @@ def dock(
 ) -> Docked:
     """Solve a run; `change` of each measurement, `tag` of each in the survey (None: without it).
 
-    How good a run is, is asked of one with twice as many states a second: half of them are enough for what is said of it.
+    How good a run at a fixed dock is, is asked of one with twice as many states a second: half of them are enough for what is said of it.
     And every second fix and heading (`every`).
     """
     true = voyage(kind, lasts_s=lasts_s, route_s=route_s)
@@ -250,7 +250,7 @@ def fixed() -> Docked:
 
 @pytest.fixture(scope="module")
 def floating() -> Docked:
-    return dock("floating", views=unlisted(voyage("floating"), 232, 0.3, 2.0), rate_hz=2.0, states_hz=2.5)
+    return dock("floating", views=unlisted(voyage("floating"), 232, 0.3, 2.0), rate_hz=2.0)
 
 
 @pytest.fixture(scope="module")
@@ -596,7 +596,7 @@ def test_a_camera_whose_mount_is_measured_by_hand_serves_as_well(
 ) -> None:
     """By 3 deg it is off; that was 1.8 m at the berth, where every sighting was refused, and 2.7 deg of heading."""
     right = {"fixed": fixed, "floating": floating}[kind]
-    docked = fixed_turned if kind == "fixed" else dock(kind, change=turned(3.0), rate_hz=2.0, states_hz=2.5)
+    docked = fixed_turned if kind == "fixed" else dock(kind, change=turned(3.0), rate_hz=2.0)
     assert docked.outcomes() == right.outcomes()
     assert docked.number("berth_p95_m") < right.number("berth_p95_m") + costs_m
     assert docked.number("berth_p95_m") < 0.25  # at the dock 0.38 m while waves could not lift it, exact mount or not

@@ -105,9 +105,9 @@ def test_too_little_time_in_common_tells_nothing() -> None:
     assert clock_apart(track, replace(far, stamps_ns=np.append(far.stamps_ns[:-1], far.stamps_ns[-1] + 10**16))) is None
 
 
-@pytest.mark.parametrize("by_s", [18.0, 40.0])
-def test_a_run_says_so_of_its_truth(by_s: float) -> None:
-    """The truth of a run in GPS time, or on a clock that is off by most of the run, and the same put right."""
+def test_a_run_says_so_of_its_truth() -> None:
+    """The truth of a run on a clock that is off by most of the run, and the same put right."""
+    by_s = 40.0
     quick = Scenario(
         path="loops", duration_s=60.0, noise="clean", pose_hz=0.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0
     )
