@@ -56,19 +56,29 @@ TURNING = np.where(np.abs(T - 20.0) < 5.0, np.radians(12.0), 0.0)  # rad/s, from
 
 
 def steps(
-    yaw: Array, rate: Array, blind: NDArray[np.bool_] | None = None, online: bool = False
+    yaw: Array,
+    rate: Array,
+    blind: NDArray[np.bool_] | None = None,
+    online: bool = False,
+    heard: NDArray[np.bool_] | None = None,
 ) -> list[tuple[float, float]]:
-    """Return times, s, and sizes, deg, of the steps of headings `yaw` (N,) beside a gyroscope that shows `rate` (N,)."""
+    """Return times, s, and sizes, deg, of the steps of headings `yaw` (N,) beside a gyroscope that shows `rate` (N,).
+
+    Args:
+        blind: (N - 1,) in which intervals it shows nothing. heard: (N,) which headings there are.
+    """
+    there = np.ones(len(T), dtype=bool) if heard is None else heard
     noise = np.random.default_rng(3).normal(0.0, np.radians(0.5), len(T))
-    turned, stamps_ns = np.cumsum(rate) / HZ, (T * 1e9).astype(np.int64)
-    unseen: NDArray[np.bool_] = np.zeros(len(T) - 1, dtype=bool) if blind is None else blind
+    stamps_ns, headings, turned = (T * 1e9).astype(np.int64)[there], (yaw + noise)[there], (np.cumsum(rate) / HZ)[there]
+    unseen: NDArray[np.bool_] = np.zeros(len(stamps_ns) - 1, dtype=bool) if blind is None else blind
+    sigma = np.radians(1.0)
     if not online:
-        found = heading_steps(stamps_ns, yaw + noise, turned, np.full(len(T), np.radians(1.0)), unseen)
+        found = heading_steps(stamps_ns, headings, turned, np.full(len(stamps_ns), sigma), unseen)
     else:
         detector = HeadingStepDetector()
         for k, stamp_ns in enumerate(stamps_ns.tolist()):
-            known = k > 0 and not unseen[k - 1]
-            detector.note(stamp_ns, float(yaw[k] + noise[k]), rate[k] / HZ if known else None, np.radians(1.0))
+            by_gyro = float(turned[k] - turned[k - 1]) if k > 0 and not unseen[k - 1] else None
+            detector.note(stamp_ns, float(headings[k]), by_gyro, sigma)
         found = list(detector.steps)
     return [(step.after_ns * 1e-9, float(np.degrees(step.size_rad))) for step in found]
 
@@ -108,3 +118,11 @@ def test_what_is_no_step(online: bool) -> None:
     assert steps(stepped, TURNING, online=online)
     # Where the gyroscope was silent the craft may have turned.
     assert not steps(stepped, TURNING, blind=np.abs(T[1:] - 8.0) < 0.3, online=online)
+
+
+@pytest.mark.parametrize("online", [False, True], ids=["offline", "online"])
+def test_across_a_silence_of_the_compass_the_gyroscope_may_have_drifted(online: bool) -> None:
+    """By 3 deg/s for 5 s."""
+    heard = np.abs(T - 20.0) > 2.5
+    drifted = np.radians(np.where(T < 20.0, 0.0, 15.0))
+    assert not steps(drifted, np.zeros_like(T), online=online, heard=heard)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.signals.level_steps import BESIDE_S, Shape, beside, level_steps
+from graphloc.signals.level_steps import BESIDE_S, GAP, Shape, beside, level_steps
 from graphloc.time import NS_PER_S, duration_ns, utc_text
 
 _LEAST_RAD = np.radians(5.0)  # smaller steps are noise and wander
@@ -73,7 +73,9 @@ def heading_steps(
     dt_s = np.diff(stamps_ns) / NS_PER_S
     usual_s = float(np.median(dt_s))
     around = beside(usual_s)
-    fastest = _around(np.where(blind, np.inf, turns / np.maximum(dt_s, 1e-3)), around)
+    # Across a silence of either the difference may have drifted.
+    unknown = blind | (dt_s > GAP * usual_s)
+    fastest = _around(np.where(unknown, np.inf, turns / np.maximum(dt_s, 1e-3)), around)
     least = np.maximum(_LEAST_RAD, _SIGMAS * _around(sigma_rad[1:], around))
     found: dict[int, float] = {}
     several = round(_DAMPED_S / max(usual_s, 1e-3))

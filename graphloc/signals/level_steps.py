@@ -18,7 +18,8 @@ FEWEST_BESIDE = 3
 """Values on either side, at least, and so many of them off to that side: two outliers are no step."""
 _FEWEST = 10  # values of all
 _SIGMAS = 8.0  # least difference of the two medians, in its sigmas
-_GAP = 3.0  # an interval that lasts so many times the usual one is a gap
+GAP = 3.0
+"""An interval that lasts so many times the usual one is a gap."""
 
 
 def beside(usual_s: float, fewest: int = FEWEST_BESIDE) -> int:
@@ -86,7 +87,7 @@ def level_steps(
     found = (size > np.maximum(floor, _SIGMAS * sigma * np.sqrt(np.pi / n))) & (
         along - shape.sure * np.sqrt(2.0) * sigma > shape.share * size
     )
-    found &= (dt_s[inner] < _GAP * usual_s) & (np.minimum(after, before) >= fewest)
+    found &= (dt_s[inner] < GAP * usual_s) & (np.minimum(after, before) >= fewest)
     if np.isfinite(shape.before):
         half = n // 2
         bends = np.median(windows[..., -half:], axis=-1) - np.median(windows[..., :half], axis=-1)
