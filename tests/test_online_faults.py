@@ -910,7 +910,7 @@ def test_a_solver_that_runs_away_is_not_believed(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(
-    ("owner", "name", "share"), [(Window, "commit", 0.16), (Links, "integrate", 0.05), (Window, "add", 0.01), (Window, "covariance", 0.1)]
+    ("owner", "name", "share"), [(Window, "commit", 0.16), (Links, "integrate", 0.1), (Window, "add", 0.01), (Window, "covariance", 0.1)]
 )  # fmt: skip
 def test_exceptions_in_the_solver_are_survived(
     monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, share: float

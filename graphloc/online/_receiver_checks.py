@@ -58,7 +58,7 @@ class ReceiverChecks:
             repeated = stream.receiver.repeated_velocity
             repeated.note(m.stamp_ns, hint.v_world_mps)
             return FROZEN_VELOCITY if repeated.is_old(m.stamp_ns, hint.v_world_mps) else ""
-        if stream.slow is not None and stream.slow.stepped and np.isfinite(hint.yaw_rad):
+        if np.isfinite(hint.yaw_rad) and stream.slow is not None and stream.slow.stepped:
             self._check_heading(stream, m.stamp_ns, at, hint)
         told_m = hint.p_world_m[:2]
         if not stream.row.absolute or not np.isfinite(told_m).all():
