@@ -86,7 +86,7 @@ class LiveTimeline:
 
     Args:
         config: rates of states and slow nodes. start_ns: stamp of the first state.
-        jumps_ns: stamps of the first fixes after position jumps. A slow node begins at the state of each, because fixes
+        jumps_ns: stamps of the first fixes (headings) after position jumps (steps). A slow node begins at the state of each, because fixes
             that share a slow node share their slow error, and fixes before and after a jump do not.
     """
 

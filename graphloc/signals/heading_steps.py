@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from graphloc.frames import Array
+from graphloc.frames import Array, wrap_angle
 from graphloc.signals.level_steps import BESIDE_S, GAP, Shape, beside, level_steps
 from graphloc.time import NS_PER_S, duration_ns, utc_text
 
@@ -28,10 +29,11 @@ _LATE_S = 0.5
 _SETTLES_S = 2.0  # time after a step within which it is over, also in a compass that filters its headings
 # At once; or in a compass that filters its headings, of which less than 0.46 would come within `_DAMPED_S` where a turn ends that the
 # gyroscope does not show.
-_AT_ONCE, _DAMPED = Shape(sure=2.0, before=0.3, after=0.3), Shape(share=0.5, sure=1.0, before=0.25, after=0.65)
+_SUDDEN, _DAMPED = Shape(sure=2.0, before=0.3, after=0.3), Shape(share=0.5, sure=1.0, before=0.25, after=0.65)
 _DAMPED_S = 0.6
 # A step is faster than all turns around it by this factor: a gyroscope that shows nothing of a turn, or less, looks like a step.
 _FASTER = 2.5
+_OUTLIERS = 5  # readings, of which two may be outliers
 _KEPT = 128  # readings and steps kept online, to bound memory
 
 
@@ -67,7 +69,7 @@ def heading_steps(
     """
     if len(stamps_ns) < 2:
         return []
-    off, turns = np.unwrap(yaw_rad - turned_rad), np.abs(np.diff(turned_rad))
+    off, turns = _unwrapped(yaw_rad - turned_rad), np.abs(np.diff(turned_rad))
     if float(np.ptp(off)) < _LEAST_RAD:
         return []
     dt_s = np.diff(stamps_ns) / NS_PER_S
@@ -79,13 +81,20 @@ def heading_steps(
     least = np.maximum(_LEAST_RAD, _SIGMAS * _around(sigma_rad[1:], around))
     found: dict[int, float] = {}
     several = round(_DAMPED_S / max(usual_s, 1e-3))
-    for shape in (_AT_ONCE, _DAMPED._replace(within=several - (several + 1) % 2)):
+    for shape in (_SUDDEN, _DAMPED._replace(within=several - (several + 1) % 2)):
         if shape.within > 0:
             faster = np.maximum(least, max(_LATE_S, _FASTER * shape.within * usual_s) * fastest)
             at_ns, changes = level_steps(stamps_ns, off[:, None], faster, shape=shape)
             new = (np.abs(np.subtract.outer(at_ns, [*found])) > BESIDE_S * NS_PER_S).all(axis=1)
             found |= zip(at_ns[new].tolist(), changes[new, 0].tolist(), strict=True)
     return [HeadingStep(*step) for step in sorted(found.items())]
+
+
+def _unwrapped(angle_rad: Array) -> Array:
+    """Return angles (N,) without turns of 360 deg: a reading, or two, that is flipped is none, and leaves the others where they are."""
+    medians = [ndimage.median_filter(axis(angle_rad), _OUTLIERS, mode="nearest") for axis in (np.sin, np.cos)]
+    level = np.unwrap(np.arctan2(*medians))
+    return np.asarray(level + wrap_angle(angle_rad - level))
 
 
 def _around(values: Array, n: int) -> Array:
@@ -114,6 +123,7 @@ class HeadingStepDetector:
 
     def __init__(self) -> None:
         self.steps: tuple[HeadingStep, ...] = ()
+        self._until_ns = 0
         self._seen: deque[tuple[int, float, float, float, bool]] = deque(maxlen=_KEPT)
 
     @property
@@ -135,9 +145,10 @@ class HeadingStepDetector:
         found = heading_steps(
             np.array(stamps, dtype=np.int64), np.array(yaw), np.array(turned), np.array(sigma), np.array(blind[1:])
         )
-        # The size of a step changes a little with each reading after it, its place by one of them.
-        since_ns = self.steps[-1].after_ns + NS_PER_S if self.steps else -1
+        # The size of a step changes a little with each reading after it, its place by one of them. No others are looked for so late.
         until_ns = stamp_ns - duration_ns(BESIDE_S + _DAMPED_S)  # of a later one it is not yet clear where it begins
+        since_ns = max(self._until_ns - NS_PER_S, self.steps[-1].after_ns + NS_PER_S if self.steps else 0)
         new = [step for step in found if since_ns < step.after_ns <= until_ns]
+        self._until_ns = until_ns
         self.steps = (*self.steps, *new)[-_KEPT:]
         return new
