@@ -123,7 +123,7 @@ def test_what_is_no_step(online: bool) -> None:
 @pytest.mark.parametrize("online", [False, True], ids=["offline", "online"])
 def test_readings_that_are_flipped_are_no_steps_and_hide_none(online: bool) -> None:
     """Two in 25, at times one after the other, as of a GNSS compass with its antennas swapped; 360 deg after one was once a step."""
-    flipped = np.pi * (np.random.default_rng(7).random(len(T)) < 0.08)
+    flipped: Array = np.where(np.random.default_rng(7).random(len(T)) < 0.08, np.pi, 0.0)
     assert not steps(flipped, np.zeros_like(T), online=online)
     ((at_s, size_deg),) = steps(flipped + np.radians(20.0 * (T >= 20.0)), np.zeros_like(T), online=online)
     assert abs(at_s - 20.0) < 1.1 / HZ  # the reading before it may be flipped
