@@ -274,7 +274,7 @@ class LiveStream:
             tape.forget(before)
 
     def jumped(self, after_ns: int, until_ns: int) -> tuple[float, Array | None]:
-        """Return the largest jump (m, rad) in `after_ns` < stamp <= `until_ns`, and the slow error (k,) that all add.
+        """Return the largest jump (m, rad) in `after_ns` < stamp <= `until_ns`, and the slow error (k,) that those at once add.
 
         0 and None where there is no jump.
         """
@@ -283,7 +283,7 @@ class LiveStream:
             return 0.0, None
         moved, step = self.slow.jump_axes, np.zeros(len(self.slow.axes))
         added = np.array([j.parts for j in found]) / self.slow.scale[moved]
-        step[moved] = added[[j.after_ns > after_ns for j in found]].sum(axis=0)
+        step[moved] = added[[j.after_ns > after_ns and j.at_once for j in found]].sum(axis=0)
         return float(np.linalg.norm(added, axis=1).max()), step
 
 

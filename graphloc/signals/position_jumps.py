@@ -210,6 +210,11 @@ class PositionJump(NamedTuple):
         return self.after_ns
 
     @property
+    def at_once(self) -> bool:
+        """Whether positions move at once, not little by little."""
+        return True
+
+    @property
     def size_m(self) -> float:
         """Length of the jump, m."""
         return math.hypot(self.east_m, self.north_m)
