@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from graphloc import app
 from graphloc.config import GnssConfig
+from graphloc.eval.metrics import errors
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import CompassHeading
 from graphloc.replay import replay
 from graphloc.signals.heading_steps import HeadingStepDetector, heading_steps
+from tests.slowly import with_few_states
 
 AT_S, STEP_RAD = 45.0, np.radians(20.0)
 ERRORS: dict[str, Callable[[float], float]] = {  # of the compass, by the time since `AT_S`, s
@@ -55,6 +57,27 @@ def test_a_compass_that_steps_does_not_take_the_heading_along(online: bool, erro
     said = (*solution.stats.warnings, *solution.stats.events)
     assert any("compass: heading step of +" in line and "does not show" in line for line in said)
     assert not any("its biases change" in line or "sigmas" in line for line in said)  # nothing else is blamed
+
+
+def test_offline_the_other_sensors_tell_whether_the_compass_or_the_gyroscope_is_wrong() -> None:
+    """Of a gyroscope that shows nothing for 5 s: the compass was blamed, and the run up to 7 m off."""
+    rates: dict[str, Any] = {"imu_hz": 50.0, "gnss_hz": 2.0, "compass_hz": 5.0, "pose_hz": 1.0}
+    run = simulate(Scenario(path="loops", duration_s=60.0, noise="drift", **rates), seed=50)
+    imu = run.recording.imu
+    assert imu is not None
+    t_s, gyro_radps = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9, imu.gyro_radps.copy()
+    dead = (t_s >= AT_S - 5.0) & (t_s < AT_S)
+    gyro_radps[dead] = np.random.default_rng(9).normal(
+        0.0, 1e-3, (int(dead.sum()), 3)
+    )  # noise, so that it is not frozen
+    solution = app.smooth_recording(
+        replace(run.recording, imu=replace(imu, gyro_radps=gyro_radps)), with_few_states(run.config, rate_hz=2.5)
+    ).solution
+    off = errors(solution.trajectory, run.truth)
+    assert np.linalg.norm(off.position_m[:, :2], axis=1).max() < 1.5
+    assert np.degrees(np.abs(off.heading_rad)).max() < 15.0  # in the gap, while she turns by 60 deg
+    assert any("contradicts the other sensors, which agree" in line for line in solution.stats.warnings)
+    assert not any("heading step" in line for line in solution.stats.warnings)
 
 
 HZ = 5.0

@@ -22,6 +22,7 @@ from graphloc.solve._legs import KnownHeading
 from graphloc.solve._memory import give_back_memory
 from graphloc.solve._offsets import offsets_of
 from graphloc.solve._parts import solve_parts
+from graphloc.solve._slow_steps import Solved, has_slow_steps, likelier, without_slow_steps
 from graphloc.solve._solution import make_solution
 from graphloc.solve.batch import BatchResult, solve_batch
 from graphloc.solve.wrong_imu import ImuWrong, left_out
@@ -57,16 +58,24 @@ def smooth(
 
     def solve(part: Recording, heading: KnownHeading | None) -> Solution:
         begun = config.with_start_heading(None) if heading is None else config.with_start_heading(*heading)
-        said = list[str]()
-        for tried in range(_MOST_TIMES + 1):
-            problem = make_problem(part, begun, datum, rows, inertial)
-            try:
-                result = solve_batch(problem, progress, doubt_imu=tried < _MOST_TIMES)
-                break
-            except ImuWrong as wrong:
-                part, why = left_out(part, wrong.spans)
-                said.append(why)
-        solution = make_solution(result.stated, part, result)
+        whole = make_problem(part, begun, datum, rows, inertial)
+
+        def solved(slow_steps: bool = True) -> Solved:
+            left, problem, said, price = part, whole, list[str](), 0.0
+            for tried in range(_MOST_TIMES + 1):
+                taken = problem if slow_steps else without_slow_steps(problem)
+                try:
+                    result = solve_batch(taken, progress, doubt_imu=tried < _MOST_TIMES)
+                    break
+                except ImuWrong as wrong:
+                    price += wrong.price(problem)
+                    left, why = left_out(left, wrong.spans)
+                    problem = make_problem(left, begun, datum, rows, inertial)
+                    said.append(why)
+            return Solved(left, result, tuple(said), price)
+
+        left, result, said, _ = likelier(solved) if has_slow_steps(whole) else solved()
+        solution = make_solution(result.stated, left, result)
         solution = replace(solution, stats=replace(solution.stats, warnings=(*said, *solution.stats.warnings)))
         if probe is None:
             return solution

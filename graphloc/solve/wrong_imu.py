@@ -49,6 +49,13 @@ class ImuWrong(Exception):
         super().__init__(spans)
         self.spans = tuple(spans)
 
+    def price(self, problem: Problem) -> float:
+        """Return the price (nats) of leaving out the IMU there, as of `wrong_span`."""
+        stamps_ns = problem.timeline.stamps_ns
+        return _PRICE * sum(
+            float(np.sum((stamps_ns > after_ns) & (stamps_ns <= until_ns))) for after_ns, until_ns in self.spans
+        )
+
 
 def left_out(recording: Recording, spans: Sequence[tuple[int, int]]) -> tuple[Recording, str]:
     """Return a recording without the samples of its IMU in some spans, and a warning."""
