@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of sensors that err, offline and online: an IMU that is wrong for seconds or warms up, a compass.
 
-`benchmarks/results.py --only E.imu` (or E.warm, A.dev) writes them down.
+`benchmarks/results.py --only E.imu` (or E.warm, E.iron, A.dev) writes them down.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from calibration import changed
 from online import LOOPS
 
 from graphloc import app
+from graphloc.config import SlowErrorConfig
 from graphloc.eval.metrics import compare_to_truth, errors
 from graphloc.eval.simulate import SimulatedRun, bl_scenario, simulate
 from graphloc.frames import Array
@@ -212,3 +213,59 @@ def compass(pool: ProcessPoolExecutor, seeds: int = 1) -> list[Row]:
     kinds = list(product(COMPASS_FAULTS, MODELS))
     labels = {(f, model): f"compass {f}, {model}, BL case 2, drift, {seeds} seeds" for f, model in kinds}
     return _rows(pool, "A.dev", _compass, labels, range(1, 1 + seeds), columns)
+
+
+# E.iron: a compass that goes off beside iron, or steps, beside RTK and a drifting receiver
+
+_IRON_SEEDS = range(523, 527)
+_IRON_RAD, _IRON_S = np.radians(20.0), 50.0
+# What a compass is off at so many seconds after `_IRON_S`, in shares of `_IRON_RAD`.
+IRON: dict[str, Callable[[float], float]] = {
+    "right": lambda s: 0.0,
+    "steps": lambda s: float(s >= 0.0),
+    "steps, with a filter of 1 s": lambda s: -np.expm1(-max(s, 0.0)),
+    "steps within 5 s": lambda s: float(np.clip(s / 5.0, 0.0, 1.0)),
+    "under a bridge": lambda s: np.exp(-0.5 * ((s - 10.0) / 5.0) ** 2),
+    "beside a crane for 30 s": lambda s: 0.5 * np.tanh(s / 3.0) - 0.5 * np.tanh((s - 30.0) / 3.0),
+}
+_RECEIVERS: dict[str, dict[str, Any]] = {"RTK": {"gnss_sigma_m": 0.02, "noise": "clean"}, "drift": {"noise": "drift"}}
+_RTK = {"slow_error": SlowErrorConfig(horizontal_sigma_m=0.03, vertical_sigma_m=0.03)}
+
+
+def _iron_figures(solution: Solution, run: SimulatedRun) -> Found:
+    """Heading RMSE and largest error, deg, share of headings in their 95 % bounds, and whether the IMU was blamed."""
+    found = errors(solution.trajectory, run.truth)
+    ours = compare_to_truth(solution.trajectory, run.truth)
+    held = ours.heading_coverage_95
+    assert held is not None
+    said = "contradicts the other sensors, which agree", "biases change more than configured"
+    blamed = any(words in line for words in said for line in solution.stats.warnings)
+    return ours.heading_rmse_deg, float(np.degrees(np.abs(found.heading_rad).max())), held, float(blamed)
+
+
+def _beside_iron(job: tuple[tuple[str, str], int]) -> tuple[Found, Found]:
+    (fault, receiver), seed = job
+    run = simulate(
+        replace(LOOPS, path="entry", duration_s=120.0, pose_hz=0.0, compass_hz=5.0, **_RECEIVERS[receiver]), seed
+    )
+    begin_ns = int(run.truth.stamps_ns[0])
+    read = tuple(
+        replace(m, yaw_rad=m.yaw_rad + _IRON_RAD * IRON[fault]((m.stamp_ns - begin_ns) * 1e-9 - _IRON_S))
+        if isinstance(m, CompassHeading)
+        else m
+        for m in run.recording.measurements
+    )
+    config = changed(run.config, "gnss", **_RTK) if receiver == "RTK" else run.config
+    return _both_ways(replace(run, recording=replace(run.recording, measurements=read), config=config), _iron_figures)
+
+
+def compass_beside_iron(pool: ProcessPoolExecutor) -> list[Row]:
+    columns: tuple[Column, ...] = (
+        ("heading RMSE", "deg", np.mean),
+        ("largest error of the heading of all", "deg", np.max),
+        ("heading in its 95 % bounds", "%", _percent),
+        ("the IMU is blamed", "runs", np.sum),
+    )
+    kinds = list(product(IRON, _RECEIVERS))
+    labels = {(f, receiver): f"compass {f}, {receiver}, {len(_IRON_SEEDS)} seeds" for f, receiver in kinds}
+    return _rows(pool, "E.iron", _beside_iron, labels, _IRON_SEEDS, columns)

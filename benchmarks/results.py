@@ -77,6 +77,7 @@ FIGURES: dict[str, Callable[[ProcessPoolExecutor], list[Row]]] = {
     "E.dark": dead_reckoning.figures,
     "E.ekf": slow_filter.figures,
     "E.imu": erring.wrong_imu,
+    "E.iron": erring.compass_beside_iron,
     "E.warm": erring.warming_imu,
     "F.3": batch.figures,
     "F.3p": where.figures,
