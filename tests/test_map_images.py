@@ -16,6 +16,7 @@ from pyproj import CRS
 from graphloc.config import AerialConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum, Geodetic
+from graphloc.frontends.aerial import image as image_module
 from graphloc.frontends.aerial.image import AerialImage
 from graphloc.frontends.aerial.layers import find_edges
 from graphloc.frontends.aerial.maps import Map
@@ -136,6 +137,46 @@ def test_the_edges_found_are_those_of_a_usual_contrast(brightness: float, contra
     assert (usual != found).sum() < 0.15 * usual.sum()
 
 
+def test_a_collar_is_no_contrast(tmp_path: Path) -> None:
+    """With the black and the white around it a hazy picture had as much as a good one."""
+    rng = np.random.default_rng(1)
+
+    def collared(grey: Bytes) -> Bytes:
+        hazy = colours((150.0 + 0.3 * grey + rng.normal(0.0, 1.0, grey.shape)).round().astype(np.uint8))
+        hazy[:, :, :120], hazy[:, :, -120:] = 0, 255
+        return hazy
+
+    seen = around(utm(tmp_path / "a.tif", collared)).pixels[40:200, 40:200].astype(int)
+    assert np.ptp(seen) > 100
+
+
+def test_a_harbour_between_the_samples_is_seen_around_the_datum(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a large image of the sea, which was stretched like a hazy one."""
+    for name, value in {"_SAMPLE_PX": 20, "_SAMPLES": 4, "_AROUND_M": 25.0}.items():
+        monkeypatch.setattr(image_module, name, value)
+
+    def sea(grey: Bytes) -> Bytes:
+        rows, columns = np.indices(grey.shape) // 5
+        return colours(np.where(grey == DARK, DARK + 20 * ((rows + columns) % 2), grey).astype(np.uint8))
+
+    assert around(utm(tmp_path / "a.tif", sea)).pixels.max() == BRIGHT
+
+
+def test_a_tile_that_cannot_be_read_is_no_matter_elsewhere(tmp_path: Path) -> None:
+    path = utm(tmp_path / "a.tif", colours, tiled=True, blockxsize=64, blockysize=64, compress="deflate")
+    with rasterio.open(path) as f:
+        offset, size = (int(f.get_tag_item(f"BLOCK_{what}_10_10", "TIFF", bidx=1)) for what in ("OFFSET", "SIZE"))
+    with path.open("r+b") as file:
+        file.seek(offset)
+        file.write(bytes(size))
+    image = AerialImage(path, Datum(SWEDEN))
+    check(image.patch(np.array([15.0, -20.0]), 30.0, 0.25))
+    with pytest.raises(InputError, match="a part of it cannot be read"):
+        image.patch(np.array([75.0, -80.0]), 10.0, 0.25)
+
+
 def test_no_data_is_reported_in_many_ways(tmp_path: Path) -> None:
     def holed(grey: Bytes) -> Bytes:
         grey[:, :300] = 0  # 60 of 140 m: 10 m west of the middle
@@ -161,6 +202,8 @@ def test_no_data_is_reported_in_many_ways(tmp_path: Path) -> None:
             ok = patch.inside[len(patch.inside) // 2]
             assert not ok[east < 4.0].any(), name
             assert ok[east > 6.0].all(), name
+        infrared = utm(tmp_path / "infrared.tif", lambda g: np.stack([g, g, g, g // 8]), photometric="RGB", alpha="YES")
+        assert around(infrared).inside.all()  # it is no alpha, though it is labelled so
         blue = utm(tmp_path / "blue.tif", lambda g: np.stack([g, g, np.zeros_like(g)]), nodata=0)
         assert around(blue).inside.all()  # no blue is a colour
     with pytest.raises(InputError, match="does not cover -40 m east"):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,8 @@ from graphloc.frontends.aerial.tiles import describe_tiles
 Pixels = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 _NET_M = 8.0
-_SAMPLES, _SAMPLE_PX = 8, 128
+_SAMPLES, _SAMPLE_PX, _AROUND_M = 8, 128, 500.0
+_MISSED = 2.0  # times as much contrast around the datum as anywhere in the samples of the whole: these have missed the harbour
 _GREY = np.array([0.299, 0.587, 0.114])  # of red, green and blue, as edges are found in
 _ENDS = [2.0, 98.0]  # percentiles
 _NOTHING = 10.0  # contrast of 8 bits below which there is nothing to see but a few small things
@@ -73,7 +75,7 @@ class AerialImage:
     One band is grey; a palette is expanded; of more bands, the ones named red, green, blue are taken, else the first
     three. An image of unusual contrast (hazy, dark, harsh, of more than 8 bits) is stretched, all bands alike, as the edges
     found depend on it (`_stretch`). There is no data where an alpha band, a mask or a nodata value says so, and where a
-    tile is missing.
+    tile is missing. What is partly transparent has data: near infrared may be labelled alpha.
 
     Raises:
         InputError: the image cannot be read, or has no georeference.
@@ -173,7 +175,7 @@ class AerialImage:
             bands = self._source.read(
                 self._bands, window=window, out_shape=(len(self._bands), rows, columns), resampling=how
             )
-            has = (self._source.dataset_mask(window=window, out_shape=(rows, columns)) > 127).astype(np.uint8)
+            has = (self._source.dataset_mask(window=window, out_shape=(rows, columns)) > 0).astype(np.uint8)
         except rasterio.errors.RasterioError as error:
             raise InputError(f"{self._path}: a part of it cannot be read ({_line(error)})") from None
         if self._palette is not None:
@@ -200,26 +202,57 @@ class AerialImage:
         return darkest - _DARKEST * step, darkest + (255.0 - _DARKEST) * step
 
     def _span(self) -> tuple[float, float]:
-        """Return the 2 % and 98 % points, in grey, of the quarter of the samples over the image that have the widest range."""
+        """Return the 2 % and 98 % points, in grey, where there is most to see: in samples all over the image, or around the datum.
+
+        A large image may show so much of sea or forest that none of its samples hits the harbour.
+        """
+        over, around = self._samples()
+        # By row, as some formats are read from the top: else each sample would be.
+        values = {
+            corner: self._grey_at(*corner) for corner in sorted({*over, *around}, key=lambda corner: corner[::-1])
+        }
+        spans = [_span_of([values[corner] for corner in corners]) for corners in (over, around)]
+        contrast, near = (brightest - darkest for darkest, brightest in spans)
+        return spans[1] if near > _MISSED * contrast else spans[0]
+
+    def _samples(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+        """Return the corners (column, row) of samples all over the image, and of as many around the datum."""
         size = np.array([self._source.width, self._source.height])
-        least = np.minimum(size, _SAMPLE_PX)
-        found = list[Array]()
-        for u, v in np.ndindex(_SAMPLES, _SAMPLES):
-            corner = ((size - least) * np.array([u, v]) / (_SAMPLES - 1)).astype(int)
-            window = rasterio.windows.Window(*corner, *least)
-            try:
-                bands = self._source.read(self._bands, window=window)
-                known = self._source.dataset_mask(window=window) > 127
-            except rasterio.errors.RasterioError as error:
-                raise InputError(f"{self._path}: a part of it cannot be read ({_line(error)})") from None
-            values = bands[:, known & np.isfinite(bands).all(axis=0)].astype(np.float64)
-            values = _GREY @ values if len(values) == 3 else values[0]
-            if len(values):
-                found.append(values)
-        found.sort(key=lambda values: float(np.ptp(np.percentile(values, _ENDS))))
-        most = found[3 * len(found) // 4 :]
-        darkest, brightest = np.percentile(np.concatenate(most), _ENDS) if most else (0.0, 1.0)
-        return float(darkest), float(max(brightest, darkest + 1e-9))
+        corners = _AROUND_M * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+        around = np.nan_to_num(self._pixels_of(corners), nan=0.0, posinf=0.0, neginf=0.0)
+        spans = (np.zeros(2), size), (np.clip(around.min(axis=0), 0, size), np.clip(around.max(axis=0), 0, size))
+        found = list[list[tuple[int, int]]]()
+        for low, high in spans:
+            steps = np.maximum(high - low - _SAMPLE_PX, 0.0) / (_SAMPLES - 1)
+            each = (np.minimum(low + steps * np.array(k), size - 1).astype(int) for k in np.ndindex(_SAMPLES, _SAMPLES))
+            found.append([(int(column), int(row)) for column, row in each])
+        return found[0], found[1]
+
+    def _grey_at(self, column: int, row: int) -> Array:
+        """Return the grey values (N,) of the pixels of a sample that have data; none if it cannot be read.
+
+        A patch says that, where it matters. Black and white are a collar, or nothing to see.
+        """
+        size = np.minimum(_SAMPLE_PX, [self._source.width - column, self._source.height - row]).tolist()
+        window = rasterio.windows.Window(column, row, *size)
+        try:
+            bands = self._source.read(self._bands, window=window)
+            known = self._source.dataset_mask(window=window) > 0
+        except rasterio.errors.RasterioError:
+            return np.zeros(0)
+        known &= np.isfinite(bands).all(axis=0)
+        if np.issubdtype(bands.dtype, np.integer):
+            known &= ~(np.isin(bands[0], [0, np.iinfo(bands.dtype).max]) & (bands == bands[0]).all(axis=0))
+        values = bands[:, known].astype(np.float64)
+        return np.asarray(_GREY @ values if len(values) == 3 else values[0])
+
+
+def _span_of(samples: Sequence[Array]) -> tuple[float, float]:
+    """Return the 2 % and 98 % points of the quarter of the samples that have the widest range."""
+    found = sorted((v for v in samples if len(v)), key=lambda values: float(np.ptp(np.percentile(values, _ENDS))))
+    most = found[3 * len(found) // 4 :]
+    darkest, brightest = np.percentile(np.concatenate(most), _ENDS) if most else (0.0, 1.0)
+    return float(darkest), float(max(brightest, darkest + 1e-9))
 
 
 def _opened(path: Path, datum: Datum) -> Any:
