@@ -27,6 +27,7 @@ from graphloc.signals.white_noise import white_noise
 from graphloc.time import NS_PER_S, stamps_of
 
 _MOST, _ONE_WAY_RAD = 0.8, np.radians(30.0)  # so many courses lie so near to their mean where they go one way; a choice
+_NEARLY_RAD = np.radians(45.0)  # the same, of half of them
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
 _EITHER = 0.01  # least share of RTK fixes, and of others, of a receiver that has RTK by turns
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
@@ -72,6 +73,12 @@ def one_way(course_rad: Array) -> bool:
         return False
     off = np.abs(wrap_angle(course_rad - np.angle(np.exp(1j * course_rad).sum())))
     return bool(np.quantile(off, _MOST) < _ONE_WAY_RAD)
+
+
+def mostly_one_way(course_rad: Array) -> bool:
+    """Return whether half of the courses (N,), rad, go nearly one way: then a current may make the median of what is off them."""
+    off = np.abs(wrap_angle(course_rad - np.angle(np.exp(1j * course_rad).sum())))
+    return len(off) > 0 and bool(np.median(off) < _NEARLY_RAD)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
-from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, yaw_from_rotation
+from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, wrap_angle, yaw_from_rotation
 from graphloc.frontends import _clock
 from graphloc.frontends._assess import MeasuredMotion, attitudes, vec
 from graphloc.frontends._assess_mount import (
@@ -53,6 +53,9 @@ _LEFT_OF_TURNS = 0.5  # largest share of a course's changes that turning about t
 # Angle between gravity, by the mount in tf, and body z, from which the IMU is upside down. No mount is off by 30 deg
 # unnoticed, but one may be by 180; a choice.
 _UPSIDE_DOWN_DEG = 150.0
+# Share of what courses leave unexplained of the IMU's accelerations, below which headings explain them far better; angle up to which a
+# mount is a quarter turn.
+_FAR_BETTER, _BY_QUARTERS_DEG = 0.8, 12.0
 # Least number of quiet seconds in a row at standstill; a craft that only changes between ahead and astern is slow for a
 # shorter time than the second.
 _QUIET_S, _STANDS_S = 2, 1.5
@@ -88,6 +91,43 @@ def turned_as_headed(
     told = f"{report.mount.evidence}; but from there {said}"
     sigma = float(np.hypot(report.mount.yaw_sigma_deg, sigma))  # that of a levelled mount, if the craft listed
     return replace(report, mount=replace(report.mount, rpy_deg=rpy, evidence=told, yaw_told=True, yaw_sigma_deg=sigma))
+
+
+def turned_as_set(
+    imu: TopicData, report: ImuReport, evidence: ImuEvidence, headed: Sequence[MeasuredMotion]
+) -> ImuReport:
+    """Return the report with a mount by quarter turns, where headings explain what the IMU feels far better than courses.
+
+    Then courses are not where she heads: a current or leeway sets her, or she goes sideways. By these alone the IMU seemed
+    turned by as much.
+
+    Args:
+        imu, report, evidence: as of `turned_as_headed`. headed: how the craft moved, with the heading by quarter turns.
+    """
+    if not report.mount.yaw_told or report.mount.tf_frame is not None or not headed:
+        return report
+    in_body = _in_body(_series_of(imu, report), report, evidence)
+    by_course, found = (yaw_in_craft(*in_body, motions) for motions in (evidence.motions, headed))
+    if by_course is None or found is None or not found.clear:
+        return report
+    R = rotation_from_rpy_deg(np.array(report.mount.rpy_deg))
+    now_deg = float(np.degrees(yaw_from_rotation(R)))
+    quarter = 90.0 * round((now_deg + found.yaw_deg) / 90.0)
+    turn_deg = float(np.degrees(wrap_angle(np.radians(quarter - now_deg))))
+    explained = 1.0 - found.coherence < _FAR_BETTER * (1.0 - by_course.coherence)
+    if not explained or abs(turn_deg - found.yaw_deg) > _BY_QUARTERS_DEG:
+        return report
+    if abs(turn_deg) < _BY_QUARTERS_DEG and not report.mount.yaw_sigma_deg:
+        return report
+    sigma_deg = (
+        report.mount.yaw_sigma_deg if report.mount.tilt_sigma_deg else 0.0
+    )  # that of a craft that perhaps listed
+    said = (
+        f"{report.mount.evidence}; but {now_deg + found.yaw_deg:z.0f} deg by {found.source} (coherence {found.coherence:.2f}): she is set "
+        f"sideways, taken as {now_deg + turn_deg:z.0f}"
+    )
+    mount = replace(report.mount, rpy_deg=yawed(turn_deg, R), evidence=said, yaw_sigma_deg=sigma_deg)
+    return replace(report, mount=mount)
 
 
 class Inertial(NamedTuple):

@@ -173,6 +173,18 @@ def with_own_north(compass: CompassReport, imus: Sequence[ImuReport]) -> Compass
     return replace(compass, drifts=abs(off_deg - 90.0 * round(off_deg / 90.0)) > _OWN_NORTH_DEG)
 
 
+def by_quarters(compass: CompassReport) -> CompassReport:
+    """Return the report of a compass that is mounted along or athwart the craft, whatever the courses say."""
+    return replace(compass, offset_deg=90.0 * round((compass.offset_deg or 0.0) / 90.0))
+
+
+def set_sideways(compass: CompassReport) -> CompassReport:
+    """Return the report of a compass whose offset from the courses is a current's or leeway's."""
+    quarter_deg = by_quarters(compass).offset_deg or None
+    why = f"{compass.why}; by what the IMU feels she is set sideways"
+    return replace(compass, offset_deg=quarter_deg, leeway_deg=None, why=why)
+
+
 def headed(motion: MeasuredMotion, compass: CompassReport, stream: TopicData) -> MeasuredMotion | None:
     """Return a motion with the attitude by a compass as it is drafted, while it has headings; None of few positions.
 

@@ -15,18 +15,27 @@ from graphloc.frontends._assess import (
     MeasuredMotion,
     ReferenceTrack,
     courses_of,
+    mostly_one_way,
     motion_of_places,
     sane,
     topic_report,
     track,
     vec,
 )
-from graphloc.frontends._assess_imu import Inertial, feels_motion, imu_report, inertial_of, turned_as_headed, yaws_of
+from graphloc.frontends._assess_imu import (
+    Inertial,
+    feels_motion,
+    imu_report,
+    inertial_of,
+    turned_as_headed,
+    turned_as_set,
+    yaws_of,
+)
 from graphloc.frontends._assess_mount import ImuEvidence, turned_as_its_heading
 from graphloc.frontends._assess_receivers import TWO_CRAFT_M, apart_warning
 from graphloc.frontends._assess_velocity import motion_of_poses, motions_of, odometry_report, velocity_report
 from graphloc.frontends._assess_world import in_map_grid, world_of
-from graphloc.frontends._compasses import compasses_of, headed, with_own_north
+from graphloc.frontends._compasses import by_quarters, compasses_of, headed, set_sideways, with_own_north
 from graphloc.frontends._contents import Contents, contents_of
 from graphloc.frontends._draft import draft_config
 from graphloc.frontends._inspect_text import render
@@ -115,7 +124,7 @@ def inspect_bag(bags: Bags | Bag) -> Inspection:
     imus, in_body = _in_axes_up(bag, gnss, _imu_reports(bag, evidence))
     best = _best_imu(bag, imus, evidence)
     compasses = compasses_of(bag, courses, best, imus)
-    ranked = _beside_headings(bag, imus, evidence, compasses)
+    ranked, compasses = _beside_headings(bag, imus, evidence, compasses)
     turned = [turned_as_its_heading(imu, compasses) for imu in ranked]
     if turned and turned[0] is not imus[0]:
         best = _best_imu(bag, turned, evidence)
@@ -293,21 +302,31 @@ def _best_imu(bag: Contents, imus: Sequence[ImuReport], evidence: ImuEvidence) -
 
 
 def _beside_headings(
-    bag: Contents, imus: Sequence[ImuReport], evidence: ImuEvidence, compasses: Sequence[CompassReport]
-) -> list[ImuReport]:
-    """Return the reports with mounts turned by the motion that a compass tells, see `turned_as_headed`.
+    bag: Contents, imus: Sequence[ImuReport], evidence: ImuEvidence, compasses: tuple[CompassReport, ...]
+) -> tuple[list[ImuReport], tuple[CompassReport, ...]]:
+    """Return the reports with mounts turned by the motion that a compass tells, see `turned_as_headed`, `turned_as_set`.
 
-    The compass is the first usable one that is no IMU's own orientation and whose offset from the course is known.
+    The compass is the first usable one that is no IMU's own orientation.
     """
-    known = (
-        c for c in compasses if c.usable and c.offset_deg is not None and c.topic not in {imu.topic for imu in imus}
-    )
-    compass = next(known, None)
-    if compass is None:
-        return list(imus)
-    moved = (headed(motion, compass, bag.aligned[compass.topic]) for motion in evidence.motions)
-    told = [motion for motion in moved if motion]
-    return [turned_as_headed(bag.aligned[imu.topic], imu, evidence, told) for imu in imus]
+
+    def moved(compass: CompassReport) -> list[MeasuredMotion]:
+        told = (headed(motion, compass, bag.aligned[compass.topic]) for motion in evidence.motions)
+        return [motion for motion in told if motion]
+
+    others = [c for c in compasses if c.usable and c.topic not in {imu.topic for imu in imus}]
+    along = next((c for c in others if c.offset_deg is not None), None)
+    if along is not None:
+        told = moved(along)
+        imus = [turned_as_headed(bag.aligned[imu.topic], imu, evidence, told) for imu in imus]
+    if not others or evidence.courses is None:
+        return list(imus), compasses
+    if others[0].offset_deg is not None and not mostly_one_way(evidence.courses.course_rad):
+        return list(imus), compasses  # a current sets her to either side
+    told = moved(by_quarters(others[0]))
+    as_set = [turned_as_set(bag.aligned[imu.topic], imu, evidence, told) for imu in imus]
+    if all(one is other for one, other in zip(as_set, imus, strict=True)):
+        return list(imus), compasses
+    return as_set, tuple(set_sideways(c) if c in others else c for c in compasses)
 
 
 def _in_axes_up(

@@ -244,6 +244,41 @@ def test_a_course_that_goes_one_way_tells_no_angle_of_imu_or_compass(tmp_path: P
             assert np.degrees(imu.mount_sigma_rad[2]) < 5.0
 
 
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0])
+@pytest.mark.parametrize("drifts", [True, False], ids=["then drifts", "often sideways"])
+def test_where_headings_explain_what_the_imu_feels_better_than_courses_she_is_set_sideways(
+    drifts: bool, yaw_deg: float, tmp_path: Path
+) -> None:
+    """In a current across, and later with it, a ferry's IMU and compass seemed 30 deg askew, and the heading was as wrong, called good."""
+    make, rng, t = Messages(2), np.random.default_rng(1), np.arange(0.0, 240.0, 0.02)
+    speed = np.where(t < 170.0, 3.0, 0.6) if drifts else 1.5 + 1.5 * np.sin(t / 11.0)
+    yaw = 0.3 + 0.15 * np.sin(t / 6.0) + (0.0 if drifts else 1.0) * np.sin(t / 25.0)
+    over = (speed + 0.5 * np.sin(t / 3.0)) * np.exp(1j * yaw) + 1.5j * np.exp(0.3j)
+    felt, rate = np.gradient(over, t) * np.exp(-1j * (yaw + np.radians(yaw_deg))), np.gradient(yaw, t)
+    way = np.cumsum(over) * 0.02
+    lla = DATUM.geodetic_from_enu(np.column_stack([way.real, way.imag, 0.0 * t]))
+    accel = np.column_stack([felt.real, felt.imag, 9.81 + 0.0 * t]) + 0.05 * rng.normal(size=(len(t), 3))
+    items: list[Item] = []
+    for k in range(len(t)):
+        stamp = START_NS + k * S // 50
+        if k % 2 == 0:
+            items.append(("/imu", stamp, make.imu(stamp, accel[k], (0.0, 0.0, rate[k]))))
+        if k % 10 == 0:
+            items.append(("/fix", stamp, make.fix(stamp, *lla[k])))
+            items.append(
+                ("/heading", stamp, make.compass(stamp, (0.0, 0.0, np.sin(yaw[k] / 2.0), np.cos(yaw[k] / 2.0))))
+            )
+    _, config, text = look(tmp_path, items, make)
+    imu, compass = config.sensors["imu"], config.sensors["compass"]
+    assert isinstance(imu, ImuConfig)
+    assert isinstance(compass, CompassConfig)
+    assert imu.mount.rpy_deg[2] == pytest.approx(yaw_deg)
+    assert compass.mount.rpy_deg[2] == 0.0
+    assert compass.mount_offset_sigma_deg >= 10.0
+    assert imu.mount_sigma_deg == ImuConfig().mount_sigma_deg
+    assert "she is set sideways" in text
+
+
 @pytest.mark.parametrize(("yaw_deg", "said"), [(0.0, False), (-84.0, True)])
 def test_an_imu_that_sits_a_little_askew_is_said(yaw_deg: float, said: bool, tmp_path: Path) -> None:
     """Drafted as a quarter turn, since leeway would look alike, in bounds that hold both: the heading was off by the rest, and no bound included it."""
