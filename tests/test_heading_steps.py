@@ -10,13 +10,15 @@ import pytest
 from numpy.typing import NDArray
 
 from graphloc import app
-from graphloc.config import GnssConfig
+from graphloc.config import GnssConfig, VesselConfig
 from graphloc.eval.metrics import errors
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import CompassHeading
+from graphloc.recording import Recording
 from graphloc.replay import replay
 from graphloc.signals.heading_steps import HeadingStepDetector, heading_steps
+from graphloc.solution import Health
 from tests.slowly import with_few_states
 
 AT_S, STEP_RAD = 45.0, np.radians(20.0)
@@ -199,3 +201,21 @@ def test_across_a_silence_of_the_compass_the_gyroscope_may_have_drifted(online: 
     heard = np.abs(T - 20.0) > 2.5
     drifted = np.radians(np.where(T < 20.0, 0.0, 15.0))
     assert not steps(drifted, np.zeros_like(T), online=online, heard=heard)
+
+
+@pytest.mark.parametrize(("off_deg", "good"), [(25.0, False), (2.0, True)])
+@pytest.mark.parametrize("solve", [app.smooth_recording, app.replay_recording], ids=["offline", "online"])
+def test_no_pose_is_good_beside_a_compass_that_is_far_off_its_mount(
+    solve: Callable[[Recording, VesselConfig], app.Run], off_deg: float, *, good: bool
+) -> None:
+    """Its mount is wrong, or that of the IMU: then the heading is as wrong as that."""
+    rates: dict[str, Any] = {"imu_hz": 50.0, "gnss_hz": 2.0, "compass_hz": 2.0, "pose_hz": 1.0}
+    run = simulate(Scenario(path="loops", duration_s=40.0, noise="clean", false_fraction=0.0, **rates), seed=11)
+    turned = tuple(
+        replace(m, yaw_rad=m.yaw_rad + np.radians(off_deg)) if isinstance(m, CompassHeading) else m
+        for m in run.recording.measurements
+    )
+    solution = solve(replace(run.recording, measurements=turned), with_few_states(run.config, rate_hz=2.5)).solution
+    late = slice(-20, None)
+    assert all(h is Health.GOOD for h in solution.health[late]) == good
+    assert all("off its mount" in why.text for why in solution.health_reason[late]) != good

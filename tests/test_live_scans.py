@@ -194,6 +194,7 @@ class Feed:
 
     mounts: Mounts
     turns: Sequence[Turn]
+    silences: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[Turn]:
         return iter(self.turns)
@@ -453,6 +454,7 @@ def turns_of(
     *messages: tuple[str, float, float],
     stamps: Literal["header", "recorded"] = "header",
     mounted: str | None = None,
+    silences: list[str] | None = None,
 ) -> list[Turn]:
     def decode_cloud(_: float, stamp_ns: int, name: str) -> Cloud:
         return Cloud(name, stamp_ns, np.ones((1, 3)), np.array([stamp_ns], dtype=np.int64))
@@ -465,7 +467,11 @@ def turns_of(
     mount = MountConfig(tf_frame=mounted) if mounted else MountConfig()
     config = AerialConfig(lidars={n: LidarConfig(topic=f"/{n}", mount=mount) for n in ("one", "two")}, stamps=stamps)
     monkeypatch.setattr(scans, "mounts_of", lambda *_: {})
-    return list(ScanFeed(Heap(*messages), config, "base_link"))  # type: ignore[arg-type]
+    feed = ScanFeed(Heap(*messages), config, "base_link")  # type: ignore[arg-type]
+    found = list(feed)
+    if silences is not None:
+        silences += feed.silences
+    return found
 
 
 def test_turns_arrive_with_the_message_that_ends_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -480,6 +486,25 @@ def test_turns_arrive_with_the_message_that_ends_them(monkeypatch: pytest.Monkey
     assert at == [[("one", 1.0), ("two", 1.02)], [("one", 3.0), ("two", 3.0)], [("one", 4.0)], [("two", 5.2)]]
     assert [(t.arrival_ns - BEGIN) / 1e9 for t in found] == [1.3, 3.2, 5.1, 5.3]
     assert [(t.stamp_ns - BEGIN) / 1e9 for t in found] == [1.02, 3.0, 4.0, 5.2]
+
+
+def test_no_turn_waits_for_a_lidar_that_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From 3 to 12 s, and from 14 s on: newer scans of the other one took each other's places, and none was matched until it came back."""
+    silences, times = list[str](), np.arange(0.0, 20.0, 0.1).round(1).tolist()
+    found = turns_of(
+        monkeypatch,
+        *((name, t + 0.01 * n, t + 0.02)
+          for t in times for n, name in enumerate(("one", "two")) if name == "one" or t < 3.0 or 12.0 <= t < 14.0),
+        silences=silences,
+    )  # fmt: skip
+    alone = [(t.stamp_ns - BEGIN) / 1e9 for t in found if len(t.clouds) == 1]
+    both = [(t.stamp_ns - BEGIN) / 1e9 for t in found if len(t.clouds) == 2]
+    assert len(both) == pytest.approx(50, abs=3)  # as soon as it is back
+    assert min(alone) < 5.2
+    assert np.diff([t for t in alone if t < 12.0]).max() < 0.15
+    assert [line.split(" from ")[0] for line in silences] == [
+        "aerial: LiDAR two was silent for 9 s", "aerial: LiDAR two was silent for 6 s"
+    ]  # fmt: skip
 
 
 def test_scans_without_stamps_are_of_when_they_were_recorded(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,11 +22,12 @@ from graphloc.frontends.aerial.submap import Turn, is_set_back
 from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
 from graphloc.frontends.part import Bags
 from graphloc.frontends.source import Bag
-from graphloc.time import NS_PER_S
+from graphloc.time import NS_PER_S, utc_text
 from graphloc.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 _TURN_S = 0.5  # scans of several LiDARs that are farther apart in time are not one turn
+_MISSED_S, _SILENT_S = 2.0, 5.0  # silence of a LiDAR after which turns do not wait for it, and which is said
 
 
 class ScanFeed:
@@ -34,6 +35,7 @@ class ScanFeed:
 
     Attributes:
         mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name.
+        silences: a warning on each LiDAR that was silent for long; grows while turns are read.
 
     Raises:
         InputError: no LiDAR, a missing topic, or a mount without a chain of transforms.
@@ -42,9 +44,10 @@ class ScanFeed:
     def __init__(self, bag: Bag, config: AerialConfig, body_frame: str) -> None:
         self.mounts = _mounts(bag, config, body_frame)
         self._bag, self._config = bag, config
+        self.silences: list[str] = []
 
     def __iter__(self) -> Iterator[Turn]:
-        return _turns(self._bag, self._config)
+        return _turns(self._bag, self._config, self.silences)
 
 
 def check_scans(bags: Bags, config: AerialConfig, folder: Path, body_frame: str, datum: Datum) -> None:
@@ -93,7 +96,7 @@ def match_bag(
                 warn(f"aerial: {line}")
         elif _take_until(at_ns, turns, matcher, track):
             yield matcher.match(track)
-        for line in bag.warnings:
+        for line in (*bag.warnings, *feed.silences):
             warn(line)
 
 
@@ -147,12 +150,54 @@ def _mounts(bag: Bag, config: AerialConfig, body_frame: str) -> dict[str, tuple[
     return mounts_of(bag, {name: lidar.mount for name, lidar in config.lidars.items()}, body_frame, "lidars")
 
 
-def _turns(bag: Bag, config: AerialConfig) -> Iterator[Turn]:
+class _Heard:
+    """When each LiDAR was heard last.
+
+    Args:
+        names: of the LiDARs. silences: gets a line on each silence of `_SILENT_S` that is over, or that the end leaves.
+    """
+
+    def __init__(self, names: Iterable[str], silences: list[str]) -> None:
+        self._last_ns: dict[str, int | None] = dict.fromkeys(names)
+        self._begin_ns, self._newest_ns, self._silences = 0, 0, silences
+
+    def note(self, name: str, stamp_ns: int) -> None:
+        self._begin_ns = self._begin_ns or stamp_ns
+        self._newest_ns = max(self._newest_ns, stamp_ns)
+        self._say(name, stamp_ns)
+        self._last_ns[name] = stamp_ns
+
+    def end(self) -> None:
+        for name in self._last_ns:
+            self._say(name, self._newest_ns)
+
+    def silent(self, name: str, stamp_ns: int) -> bool:
+        """Return whether a LiDAR has not been heard for so long that no turn waits for it."""
+        return stamp_ns - self._since_ns(name) > _MISSED_S * NS_PER_S
+
+    def _since_ns(self, name: str) -> int:
+        last_ns = self._last_ns[name]
+        return self._begin_ns if last_ns is None else last_ns
+
+    def _say(self, name: str, until_ns: int) -> None:
+        since_ns = self._since_ns(name)
+        if until_ns - since_ns > _SILENT_S * NS_PER_S:
+            self._silences.append(
+                f"aerial: LiDAR {name} was silent for {(until_ns - since_ns) / NS_PER_S:.0f} s from {utc_text(since_ns)}: scans of the "
+                "others were matched without it"
+            )
+
+
+def _turns(bag: Bag, config: AerialConfig, silences: list[str]) -> Iterator[Turn]:
     """Yield turns: the newest scan of each LiDAR, once there is one of each within `_TURN_S`.
 
     If a LiDAR is missing, or slower than that, the others form a turn without it.
+
+    Args:
+        silences: see `ScanFeed`.
     """
     names = {lidar.topic: name for name, lidar in config.lidars.items()}
+    heard = _Heard(names.values(), silences)
     frames: dict[str, str] = {}
     turn: dict[str, Cloud] = {}
     now_ns = 0
@@ -175,7 +220,11 @@ def _turns(bag: Bag, config: AerialConfig) -> Iterator[Turn]:
             continue
         offset_ns = corrected_ns(cloud.stamp_ns, config, raw.elapsed_ns) - cloud.stamp_ns
         cloud = replace(cloud, stamp_ns=cloud.stamp_ns + offset_ns, stamps_ns=cloud.stamps_ns + offset_ns)
-        if any(abs(cloud.stamp_ns - c.stamp_ns) > _TURN_S * 1e9 for n, c in turn.items() if n != name):
+        heard.note(name, cloud.stamp_ns)
+        missing = [n for n in names.values() if n not in turn]
+        # Else newer scans of the others would take the places of the older ones without end.
+        alone = name in turn and missing and all(heard.silent(n, cloud.stamp_ns) for n in missing)
+        if alone or any(abs(cloud.stamp_ns - c.stamp_ns) > _TURN_S * 1e9 for n, c in turn.items() if n != name):
             yield whole()
             turn = {}
         turn[name] = cloud
@@ -184,6 +233,7 @@ def _turns(bag: Bag, config: AerialConfig) -> Iterator[Turn]:
             turn = {}
     if turn:
         yield whole()
+    heard.end()
 
 
 def _refuse_another(frames: dict[str, str], lidar: str, msg: Any, mounted: str | None) -> None:

@@ -80,6 +80,7 @@ class LiveMatching:
                 yield from self._taken(found)
         while self._next is not None:
             self._refuse(self._next, "the run ended before it could be matched")
+        self._gathering.said += self._feed.silences
 
     def _refuse(self, turn: Turn, why: str) -> None:
         self._gathering.refuse(self._name, turn.stamp_ns, turn.why_not or why)

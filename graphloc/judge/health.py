@@ -14,11 +14,13 @@ from graphloc import keys
 from graphloc.build import Stream
 from graphloc.config import VesselConfig
 from graphloc.frames import Array
+from graphloc.graph import SlowProcess
 from graphloc.solution import LOST_BOUND_M, Cause, Health, HealthReason
 from graphloc.trajectory import bounds_95
 
 _LOST_HEADING_DEG = 45.0  # 95 % bound beyond which a heading helps nobody
 _DEAD_RECKONING_S, _SILENT_S = 5.0, 10.0
+_OFF_MOUNT = 10.0  # sigmas of a compass's offset
 
 FAR_OFF = 3.0
 """Sigmas from its setting beyond which an estimate is said to be far off."""
@@ -44,6 +46,25 @@ def why_ahead(sensor: str) -> str:
 def why_unlikely(sensor: str) -> str:
     """Return the reason why no pose is good beside a sensor that agrees only by an unlikely large slow error."""
     return f"{sensor} agrees only by more than {FAR_OFF:g} sigmas of its slow error: it contradicts the others"
+
+
+def why_off_mount(sensor: str, slow: SlowProcess | None, value: Array) -> str:
+    """Return the reason why no pose is good beside a compass that is far off its mount; empty if it is not.
+
+    Its mount or that of the IMU is wrong, and the heading with the IMU's.
+
+    Args:
+        value: (k,) of its slow state, which has its offset.
+    """
+    if slow is None:
+        return ""
+    offset = np.array([axis in slow.stepped for axis in slow.axes])
+    sigmas = float(np.max(np.abs(value / slow.sigma)[offset], initial=0.0))
+    return (
+        f"{sensor} is {sigmas:.0f} sigmas off its mount: its mount, or the IMU's, is wrong"
+        if sigmas > _OFF_MOUNT
+        else ""
+    )
 
 
 def of_receivers(since: Mapping[str, Any], config: VesselConfig) -> dict[str, Any]:

@@ -299,7 +299,8 @@ class Lag:
             if s.slow is not None and s.slow.late is not None and TIME_OFFSET in s.receiver.far_off
         ]
         unlikely = self._agreement.unlikely(self.problem.config.receiver_of)
-        return "; ".join([*map(why_in_doubt, doubtful), *map(why_late, late), *map(why_unlikely, unlikely)])
+        off = filter(None, map(self._states.why_off_mount, self.problem.streams.values()))
+        return "; ".join([*map(why_in_doubt, doubtful), *map(why_late, late), *map(why_unlikely, unlikely), *off])
 
     def _settled_ns(self, name: str) -> int:
         """Return the stamp (ns) at which another sensor of position agreed last; 0: none has.

@@ -16,7 +16,7 @@ from graphloc.errors import SolveError
 from graphloc.frames import Array
 from graphloc.graph import TIME_OFFSET, Attachment, Residual
 from graphloc.inertial import GapMotion, InertialLink
-from graphloc.judge.health import FAR_OFF
+from graphloc.judge.health import FAR_OFF, why_off_mount
 from graphloc.judge.prediction import Prediction, prediction_of
 from graphloc.judge.warnings import late_far_off
 from graphloc.motion_model import UNSURE_MPS, Moving
@@ -309,6 +309,13 @@ class States:
             if at.slow_key is not None and residual.slow_jacobian is not None:
                 J[rows, first[at.slow_key] : first[at.slow_key] + width] = residual.slow_jacobian()
         return np.asarray(J @ window.covariance([*poses, *slow]) @ J.T)
+
+    def why_off_mount(self, stream: LiveStream) -> str:
+        """Return `judge.health.why_off_mount` of the newest slow state; empty once headings have stepped."""
+        key = keys.slow(stream.number, self._problem.timeline.slow_of[self._newest.number])
+        if stream.slow is None or not stream.slow.stepped or stream.jumps or not self._window.is_committed(key):
+            return ""
+        return why_off_mount(stream.name, stream.slow, self._window.values.atVector(key))
 
     def late_far_off(self, stream: LiveStream) -> list[tuple[str, float, str]]:
         """Return `TIME_OFFSET`, the delay (s) in the slow state and a line, if that is clearly far from the setting."""

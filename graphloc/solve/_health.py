@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from graphloc import keys
 from graphloc.build import Problem, Stream
 from graphloc.frames import Array
 from graphloc.judge.decide import AGREES, CREDIBLE, Verdict, far_sigmas
-from graphloc.judge.health import FAR_OFF, health_of, late_of, why_late, why_unlikely
+from graphloc.judge.health import FAR_OFF, health_of, late_of, why_late, why_off_mount, why_unlikely
 from graphloc.judge.imu_noise import LARGEST_NOISE_SCALE
 from graphloc.signals.position_jumps import LASTS_S, why_in_doubt
 from graphloc.solution import CONTRADICTING_COST, Health, HealthReason, SolveStats
@@ -47,6 +48,10 @@ def _misfit_of_run(problem: Problem, result: BatchResult, stats: SolveStats) -> 
             sigma_s = float(stream.slow.sigma[stream.slow.late or 0])
             if abs(late_s / sigma_s) > FAR_OFF:
                 return why_late(stream.name)
+        if stream.slow is not None and not stream.heading_steps:
+            value = result.values.atVector(keys.slow(stream.number, 0))
+            if why := why_off_mount(stream.name, stream.slow, value):
+                return why
     return ""
 
 
