@@ -157,6 +157,16 @@ def test_a_gyroscope_that_is_wrong_makes_no_steps(times: float, online: bool) ->
     assert not steps(np.cumsum(rate) / HZ, times * rate, online=online)
 
 
+@pytest.mark.parametrize("hz", [5, 10, 50])
+def test_headings_that_swing_in_a_swell_make_no_steps(hz: int) -> None:
+    """By 8 deg within 11 s, as of a compass that is not gimballed: some swings were taken for steps of one that filters."""
+    rng, t = np.random.default_rng(0), np.arange(0.0, 600.0, 1.0 / hz)
+    turned = np.radians(30.0) * np.sin(t / 40.0)
+    heading = turned + np.radians(8.0) * np.sin(2.0 * np.pi * t / 11.0) + rng.normal(0.0, np.radians(1.0), len(t))
+    sigma, silent = np.full(len(t), np.radians(2.0)), np.zeros(len(t) - 1, dtype=bool)
+    assert not heading_steps((t * 1e9).astype(np.int64), heading, turned, sigma, silent)
+
+
 @pytest.mark.parametrize("online", [False, True], ids=["offline", "online"])
 def test_a_deviation_by_heading_makes_no_steps(online: bool) -> None:
     """15 deg of it, in a full turn."""

@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from graphloc.frames import Array, wrap_angle
 from graphloc.signals.level_steps import BESIDE_S, GAP, Shape, beside, level_steps
-from graphloc.signals.slow_heading_steps import shows_turns, slow_steps
+from graphloc.signals.slow_heading_steps import at_least, shows_turns, slow_steps
 from graphloc.time import NS_PER_S, duration_ns, utc_text
 
 _LEAST_RAD = np.radians(5.0)  # smaller steps are noise and wander
@@ -99,9 +99,10 @@ def heading_steps(
     found: dict[int, float] = {}
     clear_ns = stamps_ns[-1] - duration_ns(BESIDE_S + _DAMPED_S)  # of a later one it is not yet clear where it begins
     several = round(_DAMPED_S / max(usual_s, 1e-3))
-    for shape in (_SUDDEN, _DAMPED._replace(within=several - (several + 1) % 2)):
+    swings = at_least(ndimage.median_filter(off, around, mode="nearest"), around)
+    for shape, floor in ((_SUDDEN, 0.0), (_DAMPED._replace(within=several - (several + 1) % 2), swings)):
         if shape.within > 0:
-            faster = np.maximum(least, max(_LATE_S, _FASTER * shape.within * usual_s) * fastest)
+            faster = np.maximum(np.maximum(least, floor), max(_LATE_S, _FASTER * shape.within * usual_s) * fastest)
             at_ns, changes = level_steps(stamps_ns, off[:, None], faster, shape=shape)
             new = (np.abs(np.subtract.outer(at_ns, [*found])) > BESIDE_S * NS_PER_S).all(axis=1)
             new &= at_ns <= clear_ns

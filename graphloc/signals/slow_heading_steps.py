@@ -59,12 +59,24 @@ def slow_steps(
     change, windows = np.abs(smooth[n:] - smooth[:-n]), np.lib.stride_tricks.sliding_window_view
     # Of a difference of two medians, by that of readings one after the other.
     noise = float(np.median(np.abs(np.diff(off)))) / special.ndtri(0.75) * np.sqrt(0.5 * np.pi / medians)
-    usual = max(float(np.quantile(change, _USUAL)) / special.ndtri(0.5 + 0.5 * _USUAL), noise)
-    parted = change > np.maximum(windows(least, n).max(axis=1), _SIGMAS * usual)
+    parted = change > np.maximum(windows(least, n).max(axis=1), max(at_least(smooth, n), _SIGMAS * noise))
     parted &= change > windows(late, n + 1).max(axis=1)
     parted &= (change < _MOST_RAD) & ~windows(unknown, n).any(axis=1)
     parted[len(parted) - second :] = False
     return [_step(stamps_ns, smooth, first, last - 1 + n) for first, last in runs(parted)]
+
+
+def at_least(smooth: Array, n: int) -> float:
+    """Return the least size of a step beside what headings (N,) usually do within n intervals: in a swell they may swing.
+
+    Args:
+        smooth: running medians of headings less turns.
+    """
+    if len(smooth) <= n:
+        return 0.0
+    change = smooth[n:] - smooth[:-n]
+    usual = np.quantile(np.abs(change - np.median(change)), _USUAL)
+    return _SIGMAS * float(usual) / float(special.ndtri(0.5 + 0.5 * _USUAL))
 
 
 def _step(stamps_ns: NDArray[np.int64], smooth: Array, first: int, last: int) -> tuple[int, float, int]:
