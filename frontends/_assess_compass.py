@@ -125,7 +125,10 @@ def _without_courses(report: CompassReport, known: _Conventions, heard: Courses 
     elif known.by_gyro and not known.told:
         why += ", convention from the gyro"
     convention = known.told or known.by_gyro or report.convention
-    return replace(report, usable=report.msgtype == QUATERNION, convention=convention, why=why)
+    usable = report.msgtype == QUATERNION
+    if not usable:
+        why += f"; if it counts from north, as of a magnetometer or two antennas, add a sensor of kind: compass, topic: {report.topic}"
+    return replace(report, usable=usable, convention=convention, why=why)
 
 
 def _by_courses(
