@@ -269,7 +269,7 @@ class HeadingCheck:
         columns = columns - basis @ (basis.T @ columns)  # what neither the cubic nor steps explain
         observed, design = columns[:, 0], columns[:, 1:]
         residual = observed - design @ np.linalg.lstsq(design, observed, rcond=None)[0]
-        independent = _WINDOW_S / _APART_S  # fixes closer together share their errors
+        independent = min(_WINDOW_S / _APART_S, _independent(residual))  # fixes closer together share their errors
         sigma_m = float(np.sqrt(np.mean(np.abs(residual) ** 2) * len(observed) / independent))
         return first_of(design, observed, sigma_m, prior_sigmas)
 
@@ -303,6 +303,16 @@ class HeadingCheck:
         ahead_thrice = np.cumsum(ahead_twice * step_s)
         at_s = (np.array([step.until_ns for step in self._steps]) - newest.stamp_ns) * 1e-9
         return at_s, np.array([reckoned, ahead_twice, ahead_thrice, *([ahead] if place_m else [])])
+
+
+def _independent(residual: Array) -> float:
+    """Return how many of the residuals (N,), complex, count as independent, as of a first-order process.
+
+    By a receiver that drifts, or an IMU that vibrates, whose noise is integrated twice, they last for seconds.
+    """
+    alike = float(np.real(residual[:-1].conj() @ residual[1:])) / max(float(np.sum(np.abs(residual) ** 2)), 1e-12)
+    alike = min(max(alike, 0.0), 1.0 - 1.0 / len(residual))
+    return len(residual) * (1.0 - alike) / (1.0 + alike)
 
 
 def first_of(design: Array, observed: Array, sigma: float, prior_sigmas: Array) -> Fit | None:
