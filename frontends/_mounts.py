@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from graphloc.blocks import MountConfig
 from graphloc.frames import Array
@@ -48,3 +49,23 @@ def mounts_of(
     for name, (t, _) in found.items():
         bag.warnings += lever_warning(f"{block}.{name}", t, mounts[name].tf_frame)
     return found
+
+
+def refuse_another(frames: dict[str, str], name: str, msg: Any, mounted: str | None, kind: str) -> None:
+    """Refuse a message of another sensor on a topic, since one mount places all messages of a topic.
+
+    Args:
+        msg: the message. name: of the sensor. mounted: frame of its mount. kind: 'LiDAR' or 'camera'.
+        frames: by sensor, the frame of its messages, updated in place: the first one that a message names, or `mounted`
+            once a message names that.
+
+    Raises:
+        ValueError: the message names another frame.
+    """
+    frame = str(getattr(getattr(msg, "header", None), "frame_id", "")).lstrip("/")
+    own = frames[name] = frame if frame and frame == mounted else frames.get(name) or frame
+    if frame and frame != own:
+        raise ValueError(
+            f"a message in frame '{frame}' where others are in '{own}': of another {kind}, whose mount is not that of {name}; "
+            "record each on a topic of its own"
+        )

@@ -43,3 +43,16 @@ def test_an_aerial_block_at_its_bounds_is_read() -> None:
     for hull in ([], [[5, 1], [-5, 1], [0, 0], [-5, -1], [5, -1]], [[5, 1], [-5, 1], [5, -1], [5, 1]]):
         config = parse_config({"sensors": {"aerial": {**block, "hull_m": hull}}}, KINDS, "vessel.yaml")
         assert len(config.sensors["aerial"].hull_m) == len(hull)
+
+
+@pytest.mark.parametrize("shared", ["image", "vector"])
+def test_two_aerial_sensors_of_one_image_are_refused(shared: str) -> None:
+    own = {"image": "map.tif", "vector": "quays.geojson"}
+    other = {"image": "other.tif", "vector": "other.geojson", shared: own[shared], "lidars": {"aft": {"topic": "/c"}}}
+    sensors = {"fore": {"kind": "aerial", **own, "lidars": LIDARS}, "rear": {"kind": "aerial", **other}}
+    with pytest.raises(
+        ConfigError, match=f"fore and rear are both matched to {own[shared]}.*move the lidars of rear to fore"
+    ):
+        parse_config({"sensors": sensors}, KINDS, "vessel.yaml")
+    sensors["rear"]["enabled"] = False
+    assert parse_config({"sensors": sensors}, KINDS, "vessel.yaml").of_kind("aerial").keys() == {"fore"}

@@ -529,9 +529,7 @@ def test_two_lidars_on_one_topic_are_not_placed_by_one_mount(
     other, own = ("left", "right") if mounted == "right" else ("right", "left")
     refused = [t for t in found if not t.clouds]
     assert len(refused) == (1 if mounted == "right" else 2)  # its first scan is not known to be another's
-    said = (
-        f"/one: a scan in frame '{other}' where others are in '{own}': of another LiDAR, whose mount is not that of one"
-    )
+    said = f"/one: a message in frame '{other}' where others are in '{own}': of another LiDAR, whose mount is not that of one"
     assert {t.why_not for t in refused} == {f"{said}; record each on a topic of its own"}
 
 

@@ -204,6 +204,24 @@ def test_images_that_cannot_be_used(tmp_path: Path, shown: NDArray[np.uint8]) ->
     at_the_eye(found[len(wrong)].sightings[0])
 
 
+def test_two_cameras_on_one_topic_are_not_placed_by_one_mount(tmp_path: Path, shown: NDArray[np.uint8]) -> None:
+    """The first image tells which is meant, as the mount names no frame."""
+    make = Messages(2)
+
+    def framed(frame: str) -> Any:
+        msg = image(make, shown)
+        msg.header.frame_id = frame
+        return IMAGE, msg
+
+    path = bag_of(tmp_path, make, (INFO, info(make)), *map(framed, ("/bow", "port", "bow", "")))
+    found, _ = look(path)
+    assert [len(seen.sightings) for seen in found] == [1, 0, 1, 1]
+    assert found[1].troubles == (
+        f"{IMAGE}: a message in frame 'port' where others are in 'bow': of another camera, whose mount is not that of bow; "
+        "record each on a topic of its own",
+    )
+
+
 def test_jpegs_that_cannot_be_used(tmp_path: Path, shown: NDArray[np.uint8]) -> None:
     make = Messages(2)
     topic = f"{IMAGE}/compressed"

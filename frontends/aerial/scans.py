@@ -8,13 +8,12 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from graphloc.config import AerialConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array, Datum
 from graphloc.frontends._clock import corrected_ns
-from graphloc.frontends._mounts import mounts_of
+from graphloc.frontends._mounts import mounts_of, refuse_another
 from graphloc.frontends.aerial.cloud import CLOUDS, Cloud, decode_cloud
 from graphloc.frontends.aerial.live import LiveMatcher, Matched, Pace, outside
 from graphloc.frontends.aerial.own import Staying
@@ -212,7 +211,7 @@ def _turns(bag: Bag, config: AerialConfig, silences: list[str]) -> Iterator[Turn
             stamp_ns = stamp_ns_of(msg, raw.msgtype, raw.log_ns, recorded=config.stamps == "recorded")
             if stamp_ns is None:
                 raise ValueError(f"its header has no stamp: {NO_STAMP}")
-            _refuse_another(frames, name, msg, config.lidars[name].mount.tf_frame)
+            refuse_another(frames, name, msg, config.lidars[name].mount.tf_frame, "LiDAR")
             cloud = decode_cloud(msg, stamp_ns, name)
         except Exception as error:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
             said = str(error) if isinstance(error, ValueError) else f"cannot be decoded ({type(error).__name__})"
@@ -234,23 +233,3 @@ def _turns(bag: Bag, config: AerialConfig, silences: list[str]) -> Iterator[Turn
     if turn:
         yield whole()
     heard.end()
-
-
-def _refuse_another(frames: dict[str, str], lidar: str, msg: Any, mounted: str | None) -> None:
-    """Refuse a scan of another LiDAR on a topic, since one mount places all scans of a topic.
-
-    Args:
-        msg: the scan. lidar: its name. mounted: frame of the LiDAR's mount.
-        frames: by LiDAR, the frame of its scans, updated in place: the first one that a scan names, or `mounted` once a
-            scan names that.
-
-    Raises:
-        ValueError: the scan names another frame.
-    """
-    frame = str(getattr(getattr(msg, "header", None), "frame_id", "")).lstrip("/")
-    own = frames[lidar] = frame if frame and frame == mounted else frames.get(lidar) or frame
-    if frame and frame != own:
-        raise ValueError(
-            f"a scan in frame '{frame}' where others are in '{own}': of another LiDAR, whose mount is not that of {lidar}; "
-            "record each on a topic of its own"
-        )

@@ -18,7 +18,7 @@ from graphloc.config import AprilTagConfig, CameraConfig
 from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends._clock import corrected_ns
-from graphloc.frontends._mounts import mounts_of
+from graphloc.frontends._mounts import mounts_of, refuse_another
 from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
 from graphloc.frontends.part import Bags
 from graphloc.frontends.source import Bag, RawMessage
@@ -63,6 +63,7 @@ class _Eye:
     Attributes:
         name, topic: its name and topic. listed: whether the topic holds lists of detections instead of images.
         lens: its calibration; None for lists of poses without a CameraInfo. mount: position (3,) and rotation (3, 3).
+        mount_frame: frame that places the mount; None: numbers do.
     """
 
     name: str
@@ -70,6 +71,7 @@ class _Eye:
     listed: bool
     lens: CameraModel | None
     mount: tuple[Array, Array]
+    mount_frame: str | None
 
 
 @dataclass(slots=True)
@@ -103,8 +105,11 @@ def sightings_of_bag(
     with Bag(bags) as bag, ThreadPoolExecutor(_cores()) as pool:
         eyes = _eyes(bag, config, body_frame, warn)
         ahead: deque[Future[Seen]] = deque()
+        frames: dict[str, str] = {}
         for raw in bag.messages({eye.topic for eye in eyes.values()}):
-            ahead.append(pool.submit(_look, raw, _decoded(bag, raw), eyes[raw.topic], sensor, config, detector))
+            eye = eyes[raw.topic]
+            msg = _decoded(bag, raw, eye, frames)
+            ahead.append(pool.submit(_look, raw, msg, eye, sensor, config, detector))
             if len(ahead) > 2 * _cores():  # images are large: only a few are held
                 yield ahead.popleft().result()
         while ahead:
@@ -142,7 +147,7 @@ def _eyes(bag: Bag, config: AprilTagConfig, body_frame: str, warn: Callable[[str
         lens = _lens(bag, name, camera, listed, warn)
         if lens is None and "apriltag_msgs" in "".join(kinds):
             raise InputError(f"{bag.name}: cameras.{name}: its corners are pixels: give its `info_topic`")
-        found[camera.topic] = _Eye(name, camera.topic, listed, lens, mounts[name])
+        found[camera.topic] = _Eye(name, camera.topic, listed, lens, mounts[name], camera.mount.tf_frame)
     return found
 
 
@@ -201,10 +206,16 @@ def _differs(one: Any, other: Any) -> bool:
     )
 
 
-def _decoded(bag: Bag, raw: RawMessage) -> Any:
-    """Return the message, or the error that decoding raises."""
+def _decoded(bag: Bag, raw: RawMessage, eye: _Eye, frames: dict[str, str]) -> Any:
+    """Return the message, or the error that decoding raises, or that says that another camera made it.
+
+    Args:
+        frames: see `refuse_another`.
+    """
     try:
-        return bag.decode(raw)
+        msg = bag.decode(raw)
+        refuse_another(frames, eye.name, msg, eye.mount_frame, "camera")
+        return msg
     except Exception as error:  # noqa: BLE001 - damaged bytes make rosbags raise nearly anything
         return error
 

@@ -144,6 +144,17 @@ class VesselConfig(Block):
         return self
 
     @model_validator(mode="after")
+    def _each_image_once(self) -> VesselConfig:
+        """The errors of an image are shared by all that is matched to it; two sensors would each have their own."""
+        for (one, a), (other, b) in combinations(self.of_kind("aerial").items(), 2):
+            if shared := sorted({*a.files} & {*b.files} - {""}):
+                raise ValueError(
+                    f"sensors: {one} and {other} are both matched to {shared[0]}, whose misregistration would count as two: move the "
+                    f"lidars of {other} to {one}, and delete {other}"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _each_antenna_has_one_place(self) -> VesselConfig:
         """What is of another sensor's antenna sits where that does."""
         for name, sensor in self.sensors.items():
