@@ -216,9 +216,10 @@ def test_two_cameras_on_one_topic_are_not_placed_by_one_mount(tmp_path: Path, sh
     path = bag_of(tmp_path, make, (INFO, info(make)), *map(framed, ("/bow", "port", "bow", "")))
     found, _ = look(path)
     assert [len(seen.sightings) for seen in found] == [1, 0, 1, 1]
-    assert found[1].troubles == (
+    (said,) = found[1].troubles
+    assert said == (
         f"{IMAGE}: a message in frame 'port' where others are in 'bow': of another camera, whose mount is not that of bow; "
-        "record each on a topic of its own",
+        "record each on a topic of its own"
     )
 
 
