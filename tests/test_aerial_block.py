@@ -49,7 +49,10 @@ def test_an_aerial_block_at_its_bounds_is_read() -> None:
 def test_two_aerial_sensors_of_one_image_are_refused(shared: str) -> None:
     own = {"image": "map.tif", "vector": "quays.geojson"}
     other = {"image": "other.tif", "vector": "other.geojson", shared: own[shared], "lidars": {"aft": {"topic": "/c"}}}
-    sensors = {"fore": {"kind": "aerial", **own, "lidars": LIDARS}, "rear": {"kind": "aerial", **other}}
+    sensors: dict[str, dict[str, Any]] = {
+        "fore": {"kind": "aerial", **own, "lidars": LIDARS},
+        "rear": {"kind": "aerial", **other},
+    }
     with pytest.raises(
         ConfigError, match=f"fore and rear are both matched to {own[shared]}.*move the lidars of rear to fore"
     ):

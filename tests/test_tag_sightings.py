@@ -342,8 +342,8 @@ def test_images_are_not_kept(tmp_path: Path, shown: NDArray[np.uint8], monkeypat
     alive: list[weakref.ref[Any]] = []
     whole = sightings._decoded  # noqa: SLF001 - what is decoded is what must not pile up
 
-    def watched(bag: Any, raw: Any) -> Any:
-        msg = whole(bag, raw)
+    def watched(*given: Any) -> Any:
+        msg = whole(*given)
         alive.append(weakref.ref(msg.data))
         return msg
 
