@@ -23,7 +23,7 @@ from graphloc.frontends.aerial.cloud import CLOUD, Cloud, level
 from graphloc.frontends.aerial.live import LiveMatcher, Matched
 from graphloc.frontends.aerial.match import Mode
 from graphloc.frontends.aerial.matcher import Match, Matcher, Prior, Since
-from graphloc.frontends.aerial.scan import LevelCloud, outline
+from graphloc.frontends.aerial.scan import LevelCloud, inside, outline
 from graphloc.frontends.aerial.scans import ScanFeed
 from graphloc.frontends.aerial.submap import Turn
 from graphloc.frontends.source import Bag, RawMessage, TopicSummary
@@ -77,6 +77,7 @@ def test_a_bag_is_matched_as_written_out(run: Run, matched: list[Matched]) -> No
     matcher, last, before = Matcher(run.sensor, run.folder, run.datum), None, None
     window: list[Turn] = []
     expected: list[tuple[int, Any, Since | None]] = []
+    hull_m = np.array(run.sensor.hull_m, dtype=float)
     with Bag([run.folder / "run"]) as bag:
         feed = ScanFeed(bag, run.sensor, "base_link")
         for turn in feed:
@@ -89,7 +90,11 @@ def test_a_bag_is_matched_as_written_out(run: Run, matched: list[Matched]) -> No
             last = (turn.stamp_ns, here)
             stamps = np.sort(np.concatenate([*(c.stamps_ns for c in turn.clouds), [turn.stamp_ns]]))
             at_ns = int(stamps[len(stamps) // 2])
-            clouds = [c for t in window for c in t.clouds]
+            clouds = [
+                c.where(~inside(hull_m, (c.points_m @ feed.mounts[c.lidar][1].T + feed.mounts[c.lidar][0])[:, :2]))
+                for t in window
+                for c in t.clouds
+            ]
             pose = run.track.at(np.array([at_ns]))
             prior = Prior(
                 np.array([*pose.p_world_m[0, :2], pose.yaw_rad[0]]), np.sqrt(np.array([1.0, 1.0, 1e-3]))

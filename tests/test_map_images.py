@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -299,3 +301,25 @@ def test_a_tile_that_fails_is_asked_for_three_times(
         else:
             assert chart.around(np.zeros(3), SEEN) is layers
     assert len(calls) == asked
+
+
+@pytest.mark.parametrize("image", [True, False])
+def test_a_tile_without_shores_is_made_anew_by_a_scan_of_more_water(
+    image: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many scans saw none before, as among boats; not by each scan, and lines do not change."""
+    utm(tmp_path / "a.tif", colours)
+    east, north = SWEDEN.longitude_deg, SWEDEN.latitude_deg
+    line = {"type": "LineString", "coordinates": [[east, north], [east + 1e-4, north]]}
+    (tmp_path / "a.geojson").write_text(json.dumps(line))
+    source = AerialConfig(image="a.tif") if image else AerialConfig(vector="a.geojson")
+    chart, made = Map(source, tmp_path, Datum(SWEDEN)), []
+
+    def by_water(_self: Map, _middle: Array, _pose: Array, found: Outline) -> Any:
+        made.append(len(found.water_m))
+        return SimpleNamespace(shores=True if len(found.water_m) >= 50 else None)
+
+    monkeypatch.setattr(Map, "_made", by_water)
+    for water in (0, 0, 0, 0, 5, 6, 5, 3, 40, 60, 79, 90, 500):
+        chart.around(np.zeros(3), replace(SEEN, water_m=np.zeros((water, 2))))
+    assert made == ([0, 5, 40, 90] if image else [0])

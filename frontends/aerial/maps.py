@@ -36,7 +36,8 @@ _CELL_M = 0.25
 _TILE_M = 100.0  # a patch serves all priors of one tile
 _KEPT = 4  # patches that are kept, about 50 MB each
 _ON_IT = 0.7  # a line passes through cells with a larger value of its layer
-_TRIES = 3  # a first scan may have seen no water, or a disk may have failed
+_TRIES = 3  # a disk may have failed
+_MORE_WATER = 2.0  # times as much water as the last time, with which shores are looked for again where none were found
 
 # Fitted by benchmarks/tune_matcher.py on harbours drawn by chance; docs/decisions/0006. On an image a tall face may be
 # on a shadow as well; on a drawn line it is a house, since no boat is as tall.
@@ -70,7 +71,8 @@ class Map:
         self._weights = (on_image, on_lines)
         self._kept: dict[tuple[int, int], Layers] = {}
         self._beyond: dict[tuple[int, int], str] = {}  # why a tile has no layers; each scan in it asks
-        self._tries: Counter[tuple[int, int]] = Counter()
+        self._failed: Counter[tuple[int, int]] = Counter()
+        self._water: dict[tuple[int, int], int] = {}  # cells of water in the scan by which a tile was made
 
     def around(self, pose: Array, found: Outline) -> Layers:
         """Return the layers around a pose (3,); water is where the image looks like the water that a scan saw there.
@@ -82,18 +84,26 @@ class Map:
         if tile in self._beyond:
             raise InputError(self._beyond[tile])
         layers = self._kept.pop(tile, None)
-        if layers is None or (layers.shores is None and self._tries[tile] < _TRIES):
-            self._tries[tile] += 1
+        if layers is None or (layers.shores is None and self._shows_more_water(tile, found)):
             try:
                 layers = self._made((np.array(tile) + 0.5) * _TILE_M, pose, found)
             except InputError as error:
-                if self._tries[tile] >= _TRIES:
+                self._failed[tile] += 1
+                if self._failed[tile] >= _TRIES:
                     self._beyond[tile] = str(error)
                 raise
+            self._water[tile] = len(found.water_m)
         while len(self._kept) >= _KEPT:
             self._kept.pop(next(iter(self._kept)))
         self._kept[tile] = layers  # at the end: the least recently used is dropped first
         return layers
+
+    def _shows_more_water(self, tile: tuple[int, int], found: Outline) -> bool:
+        """Whether a scan may show a shore of the image where the one by which the tile was made did not.
+
+        A first scan among boats, or in a dry dock, shows no water. Making a tile takes seconds, so not each scan does it.
+        """
+        return self._image is not None and len(found.water_m) > _MORE_WATER * self._water[tile]
 
     def _made(self, middle_m: Array, pose: Array, found: Outline) -> Layers:
         cell = _CELL_M / FINE

@@ -91,8 +91,11 @@ class Submap:
         return self._newest[-1]
 
     def clouds(self) -> tuple[list[Cloud], list[list[Cloud]]]:
-        """Return the clouds of the newest turns, and those of each kept turn that is near in time and has points."""
-        now = [c for turn in self._newest for c in turn.clouds]
+        """Return the clouds of the newest turns, and those of each kept turn that is near in time and has points.
+
+        The vessel's own points are left out here, in the axes of body: where she heels, her mast is not above her hull.
+        """
+        now = [self._of_others(c) for turn in self._newest for c in turn.clouds]
         held, at_ns = {(c.lidar, c.stamp_ns) for c in now}, self.newest.stamp_ns
         near = [clouds for _, stamp_ns, clouds in self._kept if abs(stamp_ns - at_ns) <= self._around_ns]
         others = [[c for c in clouds if len(c.points_m) and (c.lidar, c.stamp_ns) not in held] for clouds in near]
@@ -105,7 +108,7 @@ class Submap:
         return stamp_ns - then_ns >= _APART_NS and float(np.hypot(*(place_m - there_m))) >= _APART_M
 
     def _of_others(self, cloud: Cloud) -> Cloud:
-        """Return a cloud without the vessel herself: in another turn, she would lie along her way."""
+        """Return a cloud without the vessel herself; in other turns, she would lie along her way."""
         if self._hull is None:
             return cloud
         t, R = self._mounts[cloud.lidar]
