@@ -27,7 +27,7 @@ from graphloc.frontends._reports import (
 )
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import Pose
-from graphloc.frontends.decode import ODOMETRY, POINT, VECTOR
+from graphloc.frontends.msgtypes import ODOMETRY, POINT, VECTOR
 from graphloc.signals.series import integral, interpolated
 from graphloc.time import NS_PER_S
 

@@ -20,7 +20,7 @@ from graphloc.frontends._receivers import Late, receiver_of
 from graphloc.frontends._reports import CompassReport, ImuReport, filtered
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
-from graphloc.frontends.decode import IMU, NUMBERS, QUATERNION
+from graphloc.frontends.msgtypes import IMU, NUMBERS, QUATERNION
 from graphloc.frontends.time_offsets import heading_time_offset
 from graphloc.frontends.turning import Turning, against_turning
 from graphloc.measurements import CompassHeading

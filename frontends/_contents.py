@@ -28,7 +28,7 @@ from graphloc.frontends._reports import bare_topic
 from graphloc.frontends._streams import Sentences, TopicData, read_streams
 from graphloc.frontends._tf import Pose, StaticTree
 from graphloc.frontends.aerial.cloud import CLOUDS
-from graphloc.frontends.decode import IMU, UNSTAMPED, header_stamp_ns
+from graphloc.frontends.msgtypes import IMU, UNSTAMPED, header_stamp_ns
 from graphloc.frontends.part import Bags
 from graphloc.frontends.source import Bag, TopicSummary, unopened
 from graphloc.frontends.tags.listed import LISTS

@@ -28,7 +28,7 @@ from graphloc.frontends._reports import (
     filtered,
 )
 from graphloc.frontends._turns import WANDERS_DEG
-from graphloc.frontends.decode import IMU, POINT
+from graphloc.frontends.msgtypes import IMU, POINT
 
 _MAGNETIC = ("HDG", "HDM")  # endings of the names of NMEA streams
 # Wander of a compass from which it is drafted, in deg and as a multiple of the usual one: in heavy waves the comparison

@@ -25,7 +25,7 @@ from graphloc.frontends._reports import (
     VelocityReport,
     bare_topic,
 )
-from graphloc.frontends.decode import UNSTAMPED
+from graphloc.frontends.msgtypes import UNSTAMPED
 from graphloc.time import GPS_AHEAD_S
 
 # Least sigma of a velocity that is averaged over seconds: its error lasts as long, and would count as white.

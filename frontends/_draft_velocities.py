@@ -21,7 +21,7 @@ from graphloc.frontends._reports import (
     through_water,
 )
 from graphloc.frontends._tf import WORLD_NAMES
-from graphloc.frontends.decode import VECTOR
+from graphloc.frontends.msgtypes import VECTOR
 
 _TO_STARBOARD = "xyz_m: [0.0, 0.0, 0.0], rpy_deg: [180.0, 0.0, 0.0]"
 _UNKNOWN_MOUNT = (

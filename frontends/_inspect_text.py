@@ -19,7 +19,7 @@ from graphloc.frontends._reports import (
     TopicReport,
     of_nmea,
 )
-from graphloc.frontends.decode import UNSTAMPED
+from graphloc.frontends.msgtypes import UNSTAMPED
 from graphloc.plain import aligned
 from graphloc.time import utc_text
 

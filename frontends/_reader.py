@@ -12,7 +12,8 @@ from graphloc.frontends._readings import Readings
 from graphloc.frontends._references import Reference
 from graphloc.frontends._rejections import Rejection, malformed
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends.decode import NO_STAMP, Decoded, decoder_of, header_stamp_ns, stamp_ns_of
+from graphloc.frontends.decode import Decoded, decoder_of
+from graphloc.frontends.msgtypes import NO_STAMP, header_stamp_ns, stamp_ns_of
 from graphloc.frontends.source import LATEST_NS, TF_MOVING, TF_STATIC, Bag, RawMessage, TopicSummary
 from graphloc.ledger import RECORDED_AT, LedgerRow, Outcome
 from graphloc.recording import Progress

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from graphloc.frames import Array
 from graphloc.frontends import _clock
-from graphloc.frontends.decode import MOST_DISTANCE_M, MOST_SPEED_MPS, pose_of
+from graphloc.frontends._standard import pose_of
+from graphloc.frontends.decode import MOST_DISTANCE_M, MOST_SPEED_MPS
 from graphloc.recording import SpeedSeries
 from graphloc.time import NS_PER_S, seconds_since
 from graphloc.trajectory import Trajectory

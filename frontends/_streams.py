@@ -19,13 +19,14 @@ from graphloc.frontends import nmea
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import FILTER, WATER, bare_topic
 from graphloc.frontends._said import Part, Said, SaidAlong, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
+from graphloc.frontends._standard import NMEA_STATUS, gps_fix_velocity_mps, nav_sat_status, nmea_sigmas_m, pose_numbers
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends.decode import (
+from graphloc.frontends.decode import no_lock
+from graphloc.frontends.msgtypes import (
     GPS_FIXES,
     IMU,
     NAV_SAT_FIX,
     NMEA,
-    NMEA_STATUS,
     NUMBERS,
     ODOMETRY,
     PLACES,
@@ -35,11 +36,6 @@ from graphloc.frontends.decode import (
     TWIST,
     UNSTAMPED,
     VECTOR,
-    gps_fix_velocity_mps,
-    nav_sat_status,
-    nmea_sigmas_m,
-    no_lock,
-    pose_numbers,
     stamp_ns_of,
 )
 from graphloc.frontends.source import TF_MOVING, TF_STATIC, Bag, RawMessage

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.errors import InputError
 from graphloc.frames import Array
-from graphloc.frontends.decode import TF, is_unit
+from graphloc.frontends._standard import is_unit
+from graphloc.frontends.msgtypes import TF
 from graphloc.frontends.source import TF_MOVING, TF_STATIC, RawMessage
 
 # Names of the body frame, likeliest first.

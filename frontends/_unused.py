@@ -14,7 +14,7 @@ from graphloc.frontends._contents import Contents
 from graphloc.frontends._reader import either
 from graphloc.frontends._reports import GnssReport, ImuReport, OdometryReport, bare_topic
 from graphloc.frontends._streams import TopicData
-from graphloc.frontends.decode import FIX_TYPES, IMU, NMEA, NUMBERS, QUATERNION, TWIST
+from graphloc.frontends.msgtypes import FIX_TYPES, IMU, NMEA, NUMBERS, QUATERNION, TWIST
 from graphloc.frontends.source import TopicSummary
 
 _KNOWN = re.compile(r"(sensor|geometry|nav|tf2|std|diagnostic|rosgraph|rcl|visualization)_?\w*_?msgs?/|rcl_interfaces/")

@@ -59,16 +59,8 @@ from graphloc.frontends._turns import (
     wander_warning,
     without_tilt,
 )
-from graphloc.frontends.decode import (
-    DECODERS_GROUP,
-    NMEA,
-    ODOMETRY,
-    TRUE_TYPES,
-    UNSTAMPED,
-    Decoded,
-    stamp_ns_of,
-    supported_types,
-)
+from graphloc.frontends.decode import DECODERS_GROUP, Decoded, supported_types
+from graphloc.frontends.msgtypes import NMEA, ODOMETRY, TRUE_TYPES, UNSTAMPED, stamp_ns_of
 from graphloc.frontends.part import Bags
 from graphloc.frontends.source import Bag, TopicSummary, unopened
 from graphloc.frontends.vendors import VENDORS

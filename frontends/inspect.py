@@ -68,7 +68,7 @@ from graphloc.frontends._unused import (
     unused_numbers,
     unused_topics,
 )
-from graphloc.frontends.decode import FIX_TYPES, IMU, PLAIN_TWIST, POSE_TYPES, TWIST, VECTOR
+from graphloc.frontends.msgtypes import FIX_TYPES, IMU, PLAIN_TWIST, POSE_TYPES, TWIST, VECTOR
 from graphloc.frontends.part import Bags
 from graphloc.frontends.source import Bag
 from graphloc.frontends.time_offsets import motion_time_offsets

@@ -31,7 +31,8 @@ from graphloc.config import (
 from graphloc.frames import Array, wrap_angle, yaw_from_heading_deg
 from graphloc.frontends._rejections import Rejection, malformed
 from graphloc.frontends._said import SaidAlong, SaidHeading, SaidPlace, SaidPose, SaidVelocity
-from graphloc.frontends.decode import Decoded, ImuReading, is_rtk, measured, rotation_of, up_if_told
+from graphloc.frontends._standard import rotation_of, up_if_told
+from graphloc.frontends.decode import Decoded, ImuReading, is_rtk, measured
 from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement, PoseFix, PoseMode
 from graphloc.time import NS_PER_S, duration_ns

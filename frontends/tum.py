@@ -10,7 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from graphloc.errors import InputError
-from graphloc.frontends.decode import MOST_DISTANCE_M, is_unit
+from graphloc.frontends._standard import is_unit
+from graphloc.frontends.decode import MOST_DISTANCE_M
 from graphloc.frontends.source import LATEST_NS
 from graphloc.time import NS_PER_S, seconds_since
 from graphloc.trajectory import Trajectory

@@ -25,8 +25,9 @@ from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._readings import Readings
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends.bag import _along_fewer, read_recording
-from graphloc.frontends.decode import DECODERS, NUMBERS, VECTOR
+from graphloc.frontends.decode import DECODERS
 from graphloc.frontends.lines import Trouble, parse
+from graphloc.frontends.msgtypes import NUMBERS, VECTOR
 from graphloc.graph import Attachment
 from graphloc.ledger import Outcome
 from graphloc.measurements import BodyVelocity, GnssPosition

@@ -8,7 +8,7 @@ from pyproj import CRS
 from pyproj.transformer import TransformerGroup
 
 from graphloc.frontends._crs import check_metric, warn_of_loose_tie
-from graphloc.frontends.decode import _from_grid
+from graphloc.frontends._standard import _from_grid
 
 
 def test_positions_in_feet_or_degrees_are_no_metres() -> None:

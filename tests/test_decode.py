@@ -8,7 +8,8 @@ import pytest
 
 from graphloc.config import CompassConfig, GnssConfig, ImuConfig, PoseConfig, VelocityConfig
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends.decode import DECODERS, ImuReading, covariance_translation_first, usable_covariance
+from graphloc.frontends._standard import covariance_translation_first
+from graphloc.frontends.decode import DECODERS, ImuReading, usable_covariance
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity, PoseFix
 from tests.bagfactory import START_NS, Messages

@@ -22,16 +22,11 @@ from graphloc.config import parse_config
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.factors import KINDS
 from graphloc.frames import Datum, Geodetic, heading_deg_from_yaw, rotation_from_rpy_deg, rpy_from_rotation, wrap_angle
+from graphloc.frontends._standard import covariance_translation_first, yaw_of_x_axis
 from graphloc.frontends._tf import StaticTree
 from graphloc.frontends.bag import read_recording
-from graphloc.frontends.decode import (
-    DECODERS,
-    IMU,
-    ImuReading,
-    covariance_translation_first,
-    usable_covariance,
-    yaw_of_x_axis,
-)
+from graphloc.frontends.decode import DECODERS, ImuReading, usable_covariance
+from graphloc.frontends.msgtypes import IMU
 from graphloc.judge.covariances import world_covariance
 from graphloc.measurements import GnssPosition, ImuSeries, Measurement, PoseFix
 from graphloc.recording import Recording

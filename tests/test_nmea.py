@@ -33,8 +33,9 @@ from graphloc.frontends._contents import contents_of
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._types import OTHER_TYPES
-from graphloc.frontends.decode import DECODERS, TWIST
+from graphloc.frontends.decode import DECODERS
 from graphloc.frontends.inspect import draft_config, render
+from graphloc.frontends.msgtypes import TWIST
 from graphloc.ledger import Outcome
 from graphloc.measurements import BodyVelocity, CompassHeading, GnssPosition, GnssVelocity, PoseFix
 from tests.bagfactory import START_NS, Item, Messages, S, write_bag

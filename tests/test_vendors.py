@@ -25,8 +25,9 @@ from graphloc.frontends._reports import EAST_AXES, NORTH_AXES
 from graphloc.frontends._streams import TopicData
 from graphloc.frontends._types import MessageTypes
 from graphloc.frontends._vendor_types import VENDOR_TYPES
-from graphloc.frontends.decode import DECODERS, QUATERNION, TWIST, ImuReading, stamp_ns_of
+from graphloc.frontends.decode import DECODERS, ImuReading
 from graphloc.frontends.inspect import draft_config, render
+from graphloc.frontends.msgtypes import QUATERNION, TWIST, stamp_ns_of
 from graphloc.frontends.vendors import VENDORS
 from graphloc.ledger import Outcome
 from graphloc.measurements import CompassHeading, GnssPosition, GnssVelocity

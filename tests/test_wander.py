@@ -14,7 +14,7 @@ from graphloc.frontends._assess import MeasuredMotion
 from graphloc.frontends._assess_wander import SPANS_S, changes, slow_error_by, way_of
 from graphloc.frontends._reports import Change
 from graphloc.frontends._streams import TopicData
-from graphloc.frontends.decode import ODOMETRY
+from graphloc.frontends.msgtypes import ODOMETRY
 from graphloc.time import NS_PER_S
 from tests.bagfactory import Messages
 from tests.test_inspect import DATUM, drive, look

@@ -18,7 +18,7 @@ from graphloc.frontends.aerial.cloud import CLOUDS, Cloud, decode_cloud
 from graphloc.frontends.aerial.live import LiveMatcher, Matched, Pace, outside
 from graphloc.frontends.aerial.own import Staying
 from graphloc.frontends.aerial.submap import Turn, is_set_back
-from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
+from graphloc.frontends.msgtypes import NO_STAMP, stamp_ns_of
 from graphloc.frontends.part import Bags
 from graphloc.frontends.source import Bag
 from graphloc.time import NS_PER_S, utc_text

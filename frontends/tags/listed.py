@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from graphloc.frames import Array
-from graphloc.frontends.decode import pose_of
+from graphloc.frontends._standard import pose_of
 
 _NEAREST_M = 0.01
 # Corners of a tag of size 2: top left, top right, bottom right, bottom left; x right, y up, z out of the print.

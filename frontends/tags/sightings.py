@@ -19,7 +19,7 @@ from graphloc.errors import InputError
 from graphloc.frames import Array
 from graphloc.frontends._clock import corrected_ns
 from graphloc.frontends._mounts import mounts_of, refuse_another
-from graphloc.frontends.decode import NO_STAMP, stamp_ns_of
+from graphloc.frontends.msgtypes import NO_STAMP, stamp_ns_of
 from graphloc.frontends.part import Bags
 from graphloc.frontends.source import Bag, RawMessage
 from graphloc.frontends.tags.bundles import Seeing, SeenTag, sightings_of
