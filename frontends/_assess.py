@@ -19,7 +19,7 @@ from graphloc.frontends import _clock
 from graphloc.frontends._fixes import RTK_SIGMA_M, radians_warning, scatter_m, stored, stored_warning, uneven
 from graphloc.frontends._reports import GnssReport, PartOfFixes, TopicReport, Vec, of_nmea
 from graphloc.frontends._sanity import far_fixes_of, lone_fixes
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends.msgtypes import IMU, PLACES, UNSTAMPED
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.signals.frozen_receiver import frozen_fixes, frozen_fixes_warning

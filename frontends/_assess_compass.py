@@ -15,7 +15,7 @@ from graphloc.frontends._assess import Courses, attitudes, one_way, sane
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import CompassReport, MountGuess, two_antennas
 from graphloc.frontends._standard import MOST_TURNS, yaw_of_x_axis
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends.msgtypes import IMU, NUMBERS, QUATERNION
 from graphloc.frontends.turning import Turning, against_turning, follows_turning
 from graphloc.signals.series import robust_sigma

@@ -38,7 +38,7 @@ from graphloc.frontends._sanity import (
     size_at_ease,
     slow_warning,
 )
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends._turns import Yaws, unit_of_turns
 from graphloc.frontends.turning import Turning, course_against_turning, left_of_turns
 from graphloc.measurements import ImuSeries

@@ -13,7 +13,7 @@ from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._assess import track
 from graphloc.frontends._clock import MOST_LATE_S
 from graphloc.frontends._reports import GnssReport
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.signals.frozen_receiver import frozen_fixes
 from graphloc.signals.series import interpolated
 from graphloc.time import NS_PER_S

@@ -25,8 +25,8 @@ from graphloc.frontends._reports import (
     of_log,
     through_water,
 )
-from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import Pose
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends.msgtypes import ODOMETRY, POINT, VECTOR
 from graphloc.signals.series import integral, interpolated
 from graphloc.time import NS_PER_S

@@ -12,7 +12,7 @@ from graphloc.config import SlowErrorConfig
 from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion, motion_of_places, sane
 from graphloc.frontends._reports import Change
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.signals.series import interpolated, rms, robust_sigma
 from graphloc.time import NS_PER_S
 

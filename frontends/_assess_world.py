@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._assess import ReferenceTrack, attitudes, sane, vec
 from graphloc.frontends._reports import Vec
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.signals.series import interpolated
 from graphloc.time import NS_PER_S
 

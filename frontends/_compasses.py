@@ -18,7 +18,7 @@ from graphloc.frontends._assess_imu import Inertial
 from graphloc.frontends._contents import Contents
 from graphloc.frontends._receivers import Late, receiver_of
 from graphloc.frontends._reports import CompassReport, ImuReport, filtered
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
 from graphloc.frontends.msgtypes import IMU, NUMBERS, QUATERNION
 from graphloc.frontends.time_offsets import heading_time_offset

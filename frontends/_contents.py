@@ -25,8 +25,9 @@ from graphloc.frontends._clock import (
     without_leaps,
 )
 from graphloc.frontends._reports import bare_topic
-from graphloc.frontends._streams import Sentences, TopicData, read_streams
+from graphloc.frontends._streams import Sentences, read_streams
 from graphloc.frontends._tf import Pose, StaticTree
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends.aerial.cloud import CLOUDS
 from graphloc.frontends.msgtypes import IMU, UNSTAMPED, header_stamp_ns
 from graphloc.frontends.part import Bags

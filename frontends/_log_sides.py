@@ -22,7 +22,7 @@ from graphloc.frames import Array, rotation_from_rpy_deg
 from graphloc.frontends._assess import sane
 from graphloc.frontends._mount_yaw import FEWEST, HALF_S, STEP_S, Felt, bent, unbroken
 from graphloc.frontends._reports import BODY_AXES, Side, VelocityReport
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.signals.series import integral
 from graphloc.time import NS_PER_S
 

@@ -14,7 +14,7 @@ from graphloc.frontends._assess_wander import changes, way_of
 from graphloc.frontends._clock import usual_latency_s
 from graphloc.frontends._contents import Contents
 from graphloc.frontends._reports import EAST_AXES, NORTH_AXES, GnssReport, VelocityReport, filtered
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends.msgtypes import FIX_TYPES
 from graphloc.frontends.time_offsets import MotionOffset, later_than
 

@@ -5,132 +5,41 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import compress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.errors import in_one_line
-from graphloc.frames import Array
 from graphloc.frontends import nmea
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import FILTER, WATER, bare_topic
-from graphloc.frontends._said import Part, Said, SaidAlong, SaidHeading, SaidInertial, SaidPlace, SaidVelocity
-from graphloc.frontends._standard import NMEA_STATUS, gps_fix_velocity_mps, nav_sat_status, nmea_sigmas_m, pose_numbers
+from graphloc.frontends._rows import LIKE, ROWS, SENTENCES, Row, nmea_speed, nmea_velocity, row_of
+from graphloc.frontends._said import Part, SaidAlong
+from graphloc.frontends._standard import gps_fix_velocity_mps
 from graphloc.frontends._tf import StaticTree
-from graphloc.frontends.decode import no_lock
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends.msgtypes import (
     GPS_FIXES,
-    IMU,
     NAV_SAT_FIX,
     NMEA,
     NUMBERS,
-    ODOMETRY,
-    PLACES,
-    PLAIN_TWIST,
     POINT,
-    QUATERNION,
     TWIST,
     UNSTAMPED,
-    VECTOR,
     stamp_ns_of,
 )
 from graphloc.frontends.source import TF_MOVING, TF_STATIC, Bag, RawMessage
 from graphloc.frontends.vendors import GEOGRAPHIC, VENDORS
-from graphloc.ledger import Outcome
-from graphloc.time import NS_PER_S
 
-Row = tuple[float, ...]
-
-
-def _xyz(v: Any) -> tuple[float, float, float]:
-    return (v.x, v.y, v.z)
-
-
-def _velocity_row(v: Any) -> tuple[float, float, float]:
-    said = _xyz(v)
-    return (np.nan, np.nan, np.nan) if no_lock(said) else said
-
-
-def _xyzw(q: Any) -> tuple[float, float, float, float]:
-    return (q.x, q.y, q.z, q.w)
-
-
-def _imu_row(m: Any) -> tuple[float, ...]:
-    covariances = (m.linear_acceleration_covariance[0], m.angular_velocity_covariance[0], m.orientation_covariance[0])
-    return (*_xyz(m.linear_acceleration), *_xyz(m.angular_velocity), *_xyzw(m.orientation), *covariances)
-
-
-def _fix_row(m: Any) -> tuple[float, ...]:
-    c = m.position_covariance
-    kind = m.position_covariance_type
-    return (m.latitude, m.longitude, m.altitude, nav_sat_status(m.status.status), kind, c[0], c[4], c[8])
-
-
-def _pose_row(m: Any) -> tuple[float, ...]:
-    return (*pose_numbers(m), 0.0, 0.0, 0.0)
-
-
-def _odometry_row(m: Any) -> tuple[float, ...]:
-    return (*_pose_row(m)[:7], *_xyz(m.twist.twist.linear))
-
-
-ROWS: dict[str, Callable[[Any], tuple[float, ...]]] = {
-    IMU: _imu_row,
-    NAV_SAT_FIX: _fix_row,
-    QUATERNION: lambda m: _xyzw(m.quaternion),
-    ODOMETRY: _odometry_row,
-    **dict.fromkeys(PLACES, _pose_row),
-    TWIST: lambda m: _velocity_row(m.twist.twist.linear),
-    PLAIN_TWIST: lambda m: _velocity_row(m.twist.linear),
-    VECTOR: lambda m: _velocity_row(m.vector),
-    **dict.fromkeys(GPS_FIXES, _fix_row),
-    **dict.fromkeys(NUMBERS, lambda m: (m.data,)),
-}
 # Topics of places that are not measured by a sensor of the craft: goals, origins of filters, other vessels, the truth.
 _ELSEWHERE = re.compile(
     r"click|person|obstacle|look_?ahead|origin|home(?![a-z])|set_?point|goal|target|waypoint|cmd|command|desired|contact|aton|anchor|truth|/gt(?![a-z])",
     re.IGNORECASE,
 )
 _HEADING = re.compile(r"head|hdg|hdt|yaw|compass|azimuth", re.IGNORECASE)  # a topic of bare numbers may be a heading
-
-
-def _nmea_place(text: str, wanted: str) -> SaidPlace | Rejection:
-    said = nmea.fix(text, [wanted])
-    if isinstance(said, Rejection):
-        return said
-    sigmas_m = nmea_sigmas_m(said, (0.0, 0.0))  # only the qualities of RTK imply one
-    return SaidPlace(said.latitude_deg, said.longitude_deg, said.height_m, NMEA_STATUS.get(said.quality, 0), *sigmas_m)
-
-
-def _nmea_heading(text: str, wanted: str) -> SaidHeading | Rejection:
-    said = nmea.heading_deg(text, [wanted])
-    return said if isinstance(said, Rejection) else SaidHeading(float(np.radians(90.0 - said)))
-
-
-def _nmea_velocity(text: str, wanted: str) -> SaidVelocity | Rejection:
-    said = nmea.velocity_mps(text, [wanted])
-    return said if isinstance(said, Rejection) else SaidVelocity((*said, 0.0))
-
-
-def _nmea_speed(text: str, wanted: str, through: str = "ground") -> SaidVelocity | Rejection:
-    said = nmea.log_velocity_mps(text, [wanted], through)
-    if isinstance(said, Rejection):
-        return said
-    ahead, port = (*said, 0.0)[:2]
-    return SaidVelocity((ahead, port, 0.0))
-
-
-# By sentence: the kind of sensor that reads it, and what it says.
-SENTENCES: dict[str, tuple[str, Callable[[str, str], Said | Rejection]]] = {
-    **dict.fromkeys(nmea.HEADINGS, ("compass", _nmea_heading)),
-    "VTG": ("gnss_velocity", _nmea_velocity),
-    **dict.fromkeys(nmea.SPEEDS, ("body_velocity", _nmea_speed)),
-    **dict.fromkeys(nmea.PLACES, ("gnss", _nmea_place)),
-}
 _SATELLITES = re.compile("(G[A-Z]|BD)[A-Z]{3}")  # a talker ID that names the satellite systems of a receiver
 # Sentences of two talkers that are recorded less than so many steps apart are of the same moment; the largest share of
 # such sentences that talkers of one receiver may have.
@@ -141,184 +50,6 @@ _DAY_S, _FEWEST_TIMES = 86_400.0, 20
 _AS_OFTEN = 0.8
 COURSE, HEADING = " (course, speed)", " (heading)"
 """Endings of the names of streams: what RMC, a GPSFix or a maker's message says beside a place."""
-# By kind of sensor, of what NMEA and makers' messages say: the message type of the same content, and a row without a value.
-_LIKE: dict[str, tuple[str, Row]] = {
-    "imu": (IMU, (*[np.nan] * 6, *[0.0] * 4, 0.0, 0.0, -1.0)),
-    "gnss": (NAV_SAT_FIX, (np.nan, np.nan, np.nan, -1.0, 0.0, 0.0, 0.0, 0.0)),
-    "gnss_velocity": (TWIST, (np.nan, np.nan, np.nan)),
-    "compass": (QUATERNION, (0.0, 0.0, np.nan, np.nan)),
-    "body_velocity": (TWIST, (np.nan, np.nan, np.nan)),
-}
-
-
-def _row_of(said: Said | Rejection, kind: str) -> Row | None:
-    """Return the row of what a sentence or a maker's message says to a kind of sensor; None if it is damaged."""
-    match said:
-        case Rejection():
-            return None if said.outcome is Outcome.MALFORMED else _LIKE[kind][1]
-        case SaidInertial():
-            return (*said.accel_mps2, *said.gyro_radps, *_LIKE["imu"][1][6:])
-        case SaidPlace():
-            h, v = said.horizontal_m**2, said.vertical_m**2
-            return (*said[:3], said.status, 2.0 * (h > 0.0), h, h, v)
-        case SaidVelocity():
-            return said.v_mps
-        case SaidHeading():
-            return (0.0, 0.0, float(np.sin(said.angle_rad / 2.0)), float(np.cos(said.angle_rad / 2.0)))
-        case SaidAlong():
-            ahead, starboard, down = said.v_mps
-            return (ahead, -starboard, -down)  # to port, up
-
-
-_MOST = 1e12  # no measurement in SI units, geodetic or of a map grid is larger
-
-
-@dataclass(slots=True)
-class TopicData:
-    """Columns of one topic: stamps and recording times (N,) ns, and a row of numbers per message, by type (see `ROWS`).
-
-    Arrays are made once, and cannot be written to.
-
-    Attributes:
-        topic: name of the stream, for a plain topic that of the topic. msgtype: the type, or that of the same content.
-        frame_id: the first one that is not empty. frames: how many messages name each frame_id.
-        undecodable: number of messages that cannot be decoded. broken: why, of the first one.
-        no_stamp: number of messages that were dropped because they have no stamp.
-        recorded: whether the stamps are recording times, because the headers hold none, or whole seconds only.
-        drift_ppm: by how much the clock ran fast; what it gained has been taken off the stamps.
-        part: which part of a maker's message it is; None of other messages.
-        filtered: how many of a maker's messages say that a filter made them.
-        tuples: the rows as they were added. files: the file of each message.
-        elapsed: (N,) ns from the beginning of the bag until a message was recorded.
-    """
-
-    topic: str
-    msgtype: str
-    frame_id: str = ""
-    undecodable: int = 0
-    broken: str = ""
-    no_stamp: int = 0
-    recorded: bool = False
-    drift_ppm: float = 0.0
-    part: Part | None = None
-    filtered: int = 0
-    frames: Counter[str] = field(default_factory=Counter)
-    _stamps: list[int] = field(default_factory=list)
-    _logs: list[int] = field(default_factory=list)
-    tuples: list[tuple[float, ...]] = field(default_factory=list)
-    files: list[str] = field(default_factory=list)
-    elapsed: list[int] = field(default_factory=list)
-    # Arrays made from the lists, once each; copies of a stream share the rows.
-    _rows: Array | None = field(default=None, compare=False)
-    _made: dict[str, NDArray[np.int64]] = field(default_factory=dict, init=False, compare=False)
-
-    def add(self, stamp_ns: int, log_ns: int, row: tuple[float, ...], file: str, elapsed_ns: int = 0) -> None:
-        """Append a message."""
-        if self._made or self._rows is not None:
-            self._anew()
-        self.files.append(file)
-        self.elapsed.append(elapsed_ns)
-        self._stamps.append(stamp_ns)
-        self._logs.append(log_ns)
-        self.tuples.append(row)
-
-    def _anew(self) -> None:
-        """Forget the arrays that were made from the lists."""
-        self._rows = None
-        self._made.clear()
-
-    @classmethod
-    def joined(cls, topic: str, parts: Sequence[TopicData]) -> TopicData:
-        """Return several streams of one type as one, with messages in the order of recording."""
-        whole = cls(topic, parts[0].msgtype, parts[0].frame_id, sum(p.undecodable for p in parts))
-        whole.frames = sum((p.frames for p in parts), Counter())
-        messages = (message for p in parts for message in zip(*p.columns(), strict=True))
-        for message in sorted(messages, key=lambda message: message[1]):
-            whole.add(*message)
-        return whole
-
-    def columns(self) -> tuple[list[Any], ...]:
-        """Return what there is of each message: stamps, recording times, rows, files, times since the beginning."""
-        return self._stamps, self._logs, self.tuples, self.files, self.elapsed
-
-    def settle(self) -> None:
-        """Drop messages without a stamp, in place; where stamps do not tell the time, use recording times.
-
-        They do not if all are equal, or if they are whole seconds, see `_in_whole_seconds`.
-        """
-        stamps = self.stamps_ns
-        if len(stamps) > 1 and (bool((stamps == stamps[0]).all()) or self._in_whole_seconds()):
-            self.recorded, self._stamps = True, list(self._logs)
-            self._anew()
-            return
-        there = (stamps != 0).tolist()
-        self.no_stamp = there.count(False)
-        if not self.no_stamp:
-            return
-        for column in self.columns():
-            column[:] = list(compress(column, there))
-        self._anew()
-
-    def _in_whole_seconds(self) -> bool:
-        """Return whether stamps are whole seconds though several measurements a second were recorded, one by one.
-
-        Not so of a receiver that measures once a second, whose driver repeats each measurement with its stamp.
-        """
-        if (self.stamps_ns % NS_PER_S).any():
-            return False
-        told = {(stamp_ns, repr(row)) for stamp_ns, row in zip(self._stamps, self.tuples, strict=True)}
-        return 4 * len(set(self._stamps)) < 3 * min(len(told), len(set(self._logs)))
-
-    def later(self, by_ns: int) -> TopicData:
-        """Return the stream with `by_ns` added to its stamps."""
-        return replace(self, _stamps=[stamp_ns + by_ns for stamp_ns in self._stamps])
-
-    def logged(self, logs_ns: NDArray[np.int64]) -> TopicData:
-        """Return the stream with other recording times (N,), its stamps where headers hold none."""
-        logs = logs_ns.tolist()
-        return replace(self, _logs=logs, _stamps=self._stamps if self.stamped_by_header else logs)
-
-    @property
-    def stamped_by_header(self) -> bool:
-        """Whether the stamps are not the recording times."""
-        return self._stamps != self._logs
-
-    def stamped(self, stamps_ns: NDArray[np.int64]) -> TopicData:
-        """Return the stream with other stamps (N,)."""
-        return replace(self, _stamps=stamps_ns.tolist())
-
-    def without_drift(self, ppm: float) -> TopicData:
-        """Return the stream with the gain of a clock that runs fast by `ppm` taken off its stamps."""
-        gained = np.rint(1e-6 * ppm * np.array(self.elapsed, dtype=float)).astype(np.int64)
-        return replace(self, _stamps=(self.stamps_ns - gained).tolist(), drift_ppm=ppm)
-
-    @property
-    def stamps_ns(self) -> NDArray[np.int64]:
-        """Header stamps in order of arrival."""
-        return self._array("stamps", self._stamps)
-
-    @property
-    def logs_ns(self) -> NDArray[np.int64]:
-        """Recording times in order of arrival."""
-        return self._array("logs", self._logs)
-
-    def _array(self, name: str, column: list[int]) -> NDArray[np.int64]:
-        if name not in self._made:
-            self._made[name] = np.array(column, dtype=np.int64)
-            self._made[name].flags.writeable = False
-        return self._made[name]
-
-    @property
-    def rows(self) -> Array:
-        """Values (N, k); NaN for values too large to be measurements, whose squares would overflow."""
-        if self._rows is None:
-            self._rows = np.array(self.tuples, dtype=float)
-            self._rows[np.abs(self._rows) > _MOST] = np.nan
-            self._rows.flags.writeable = False
-        return self._rows
-
-    def __len__(self) -> int:
-        return len(self._stamps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -404,7 +135,7 @@ def _empty_streams(bag: Bag) -> dict[str, TopicData]:
             and not (t.msgtypes[0] in GEOGRAPHIC and _ELSEWHERE.search(t.topic))
         ):
             for name, part in _parts(t.topic, t.msgtypes[0]):
-                streams[name] = TopicData(name, _LIKE[part.kind][0], part=part)
+                streams[name] = TopicData(name, LIKE[part.kind][0], part=part)
     return streams
 
 
@@ -573,7 +304,7 @@ def _said_of(part: Part, msg: Any, name: str, streams: dict[str, TopicData]) -> 
         name += WATER
         streams.setdefault(name, TopicData(name, TWIST, part=part))
     streams[name].filtered += getattr(said, "filtered", False)
-    return streams[name], _row_of(said, part.kind)
+    return streams[name], row_of(said, part.kind)
 
 
 def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tuple[TopicData, Row | None]]:
@@ -584,10 +315,10 @@ def _sentences(topic: str, msg: Any, streams: dict[str, TopicData]) -> list[tupl
         if kind in SENTENCES:
             of, read = SENTENCES[kind]
             name = f"{topic} {talker}{kind}"
-            stream = streams.setdefault(name, TopicData(name, _LIKE[of][0]))
-            said.append((stream, _row_of(read(text, talker + kind), of)))
-        if kind == "RMC" and (row := _row_of(_nmea_velocity(text, talker + kind), "gnss_velocity")) is not None:
+            stream = streams.setdefault(name, TopicData(name, LIKE[of][0]))
+            said.append((stream, row_of(read(text, talker + kind), of)))
+        if kind == "RMC" and (row := row_of(nmea_velocity(text, talker + kind), "gnss_velocity")) is not None:
             said.append((streams.setdefault(name + COURSE, TopicData(name + COURSE, TWIST)), row))
-        if kind == "VBW" and (row := _row_of(_nmea_speed(text, talker + kind, "water"), "body_velocity")) is not None:
+        if kind == "VBW" and (row := row_of(nmea_speed(text, talker + kind, "water"), "body_velocity")) is not None:
             said.append((streams.setdefault(name + WATER, TopicData(name + WATER, TWIST)), row))
     return said

@@ -13,7 +13,7 @@ from graphloc.frontends._assess_imu import samples_of
 from graphloc.frontends._contents import Contents
 from graphloc.frontends._reader import either
 from graphloc.frontends._reports import GnssReport, ImuReport, OdometryReport, bare_topic
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends.msgtypes import FIX_TYPES, IMU, NMEA, NUMBERS, QUATERNION, TWIST
 from graphloc.frontends.source import TopicSummary
 

@@ -57,8 +57,8 @@ from graphloc.frontends._reports import (
     filtered,
 )
 from graphloc.frontends._scanners import cameras_of, lidars_of
-from graphloc.frontends._streams import TopicData
 from graphloc.frontends._tf import Pose
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends._unused import (
     lacking,
     shared_topics,

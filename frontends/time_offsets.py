@@ -21,7 +21,7 @@ from graphloc.frontends._clock import (
     usual_latency_s,
 )
 from graphloc.frontends._mount_yaw import FEWEST, MOVES_M, STEP_S, Felt, bent, unbroken, windows_of
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends._turns import without_line
 from graphloc.frontends.turning import Turning
 from graphloc.signals.series import integral

@@ -26,7 +26,7 @@ from graphloc.frontends._assess import NO_TRACK, ReferenceTrack
 from graphloc.frontends._assess_velocity import EITHER, axes_of, velocity_report
 from graphloc.frontends._fixes import radians_warning
 from graphloc.frontends._reports import BODY_AXES, EAST_AXES
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends.inspect import Inspection, draft_config, render
 from graphloc.frontends.msgtypes import TWIST
 from graphloc.frontends.source import Bag, RawMessage

@@ -31,7 +31,7 @@ from graphloc.frontends._assess import NO_TRACK
 from graphloc.frontends._assess_velocity import motions_of, velocity_report
 from graphloc.frontends._contents import contents_of
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends._types import OTHER_TYPES
 from graphloc.frontends.decode import DECODERS
 from graphloc.frontends.inspect import draft_config, render

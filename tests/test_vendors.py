@@ -22,7 +22,7 @@ from graphloc.frontends._assess_compass import compass_report
 from graphloc.frontends._assess_velocity import velocity_report
 from graphloc.frontends._rejections import Rejection
 from graphloc.frontends._reports import EAST_AXES, NORTH_AXES
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends._types import MessageTypes
 from graphloc.frontends._vendor_types import VENDOR_TYPES
 from graphloc.frontends.decode import DECODERS, ImuReading

@@ -13,7 +13,7 @@ from graphloc.frames import Array
 from graphloc.frontends._assess import MeasuredMotion
 from graphloc.frontends._assess_wander import SPANS_S, changes, slow_error_by, way_of
 from graphloc.frontends._reports import Change
-from graphloc.frontends._streams import TopicData
+from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends.msgtypes import ODOMETRY
 from graphloc.time import NS_PER_S
 from tests.bagfactory import Messages
