@@ -229,7 +229,7 @@ def _righted(report: ImuReport, imu: TopicData, samples: ImuSamples, evidence: I
         return report
     against = "its gyro turns against the courses of the fixes"
     if pose is None and sense < 0:
-        why = f"{against}: its accelerations look inverted, or its axes are left-handed; or the fixes have latitude and longitude swapped"
+        why = f"{against}: its accelerations look inverted, its axes are left-handed, or the fixes have latitude and longitude swapped"
         mount = mount_guess(samples._replace(accel=-samples.accel), evidence)
         mount = replace(mount, evidence=f"with accelerations inverted, {mount.evidence}")
         return replace(report, gravity="inverted", mount=mount, why=(*report.why, why))

@@ -92,7 +92,7 @@ def _axes_by(
     if noise > speed:
         return (
             None,
-            f"the fixes scatter by {reference.scatter_m:.1f} m, too much to check it against at {speed:.1f} m/s",
+            f"the fixes scatter by {reference.scatter_m:.1f} m, too much to check it against them at {speed:.1f} m/s",
         )
     # A speed laid along the chords differs from them along their direction only: half of the noise's power.
     parts = (1.0, 1.0, 0.5**0.5)

@@ -113,7 +113,7 @@ class ClockStep(NamedTuple):
     def said(self, whose: str) -> str:
         """Return the step in words, with what to do."""
         said = self.what(whose)
-        return f"{said}: no time_offset_s holds on both sides, and no bound includes it; take one side (--start, --duration)"
+        return f"{said}: no time_offset_s holds on both sides, and no bound includes it; use the part on one side (--start, --duration)"
 
     def what(self, whose: str) -> str:
         """Return the step in words."""
@@ -203,7 +203,7 @@ def without_leaps(stamps_ns: Stamps, logs_ns: Stamps, latency_s: float, whose: s
     apart_s = [abs(usual_latency_s(stamps_ns[part], logs_ns[part]) - latency_s) for part in parts]
     off_ns -= off_ns[parts[int(np.argmin(apart_s))][0]]
     what, wrong = " and ".join(at.what(whose) for _, at in found), int((off_ns != 0).sum())
-    said = f"{what}: {wrong} of its stamps are put right by that; the others are nearer to the IMU's"
+    said = f"{what}: {wrong} of its stamps are corrected by that; the others are nearer to the IMU's"
     return stamps_ns - off_ns, said
 
 
@@ -326,8 +326,8 @@ class RecordingPace(NamedTuple):
         """The pace in words."""
         took_s, grown_s = (float(of[-1] - of[0]) / NS_PER_S for of in (self.logs_ns, self.late_ns))
         return (
-            f"recording took {took_s:.0f} s while the stamps of the headers went on by {took_s - grown_s:.0f} s, as of a simulator, or of a bag "
-            "that was played at another speed or with pauses: the stamps are taken"
+            f"recording took {took_s:.0f} s while the stamps of the headers went on by {took_s - grown_s:.0f} s, as from a simulator, or from a bag "
+            "that was played at another speed or with pauses: the stamps are used"
         )
 
 

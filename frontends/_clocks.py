@@ -77,9 +77,9 @@ def _epoch_warning(own: _SensorClock, reference: _SensorClock) -> list[str]:
     way = "behind" if behind_s > 0 else "ahead of"
     instead = f" instead of {now_s:g}" if now_s else ""
     said = f"its clock is {abs(behind_s):.3f} s {way} that of {reference.sensor}, by the recording times"
-    cure = f"set its time_offset_s to {now_s + behind_s:.3f}{instead} (that includes the difference of their transport delays)"
+    cure = f"set its time_offset_s to {now_s + behind_s:.3f}{instead} (this includes the difference of their transport delays)"
     return [
-        f"{own.sensor}: {said}; {cure}, unless its messages take so long on their way (by radio): see what `inspect` drafts"
+        f"{own.sensor}: {said}; {cure}, unless its messages take that long to arrive (by radio): see what `inspect` drafts"
     ]
 
 
@@ -89,7 +89,7 @@ def _gain_warning(own: _SensorClock, reference: _SensorClock, gain_s: float) -> 
     when = next((f", {at.when}" for at in steps if at), "")
     drift_ppm = own.gain.drift_ppm - reference.gain.drift_ppm
     if when:
-        cure = "take one side (--start, --duration), or synchronise the clocks"
+        cure = "use the part on one side (--start, --duration), or synchronise the clocks"
     elif own.gain.even and reference.gain.even and drift_ppm:
         cure = f"set its clock_drift_ppm to {own.readings.config.clock_drift_ppm + drift_ppm:.1f}"
     else:

@@ -233,7 +233,7 @@ def _error_lines(compass: CompassReport) -> list[str]:
         usual, why = wander, "as it wanders beside the gyro; iron near it, or its own filter"
     if compass.drifts:
         usual = max(_DRIFTS[0], usual)
-        why = "its north is its own, as without a magnetometer: it drifts; 0.5 if it is magnetic"
+        why = "its north is its own, as without a magnetometer, so it drifts; 0.5 if it is magnetic"
     lines.append(f"  wander_sigma_deg: {usual:.1f}  # guess: {why}")
     return [*lines, f"  wander_time_constant_s: {_DRIFTS[1]:.0f}  # guess: likewise"] if compass.drifts else lines
 
@@ -288,7 +288,7 @@ def _datum_line(inspection: Inspection) -> str:
     frames = [item.frame_id for item in inspection.odometry if item.role == "pose"]
     if frames and not (inspection.gnss or inspection.in_a_grid):
         where = "latitude_deg: , longitude_deg: , height_m: 0"
-        return f"# datum: {{{where}}}  # set it where the origin of '{frames[0]}' lies: nothing in the bag tells"
+        return f"# datum: {{{where}}}  # set it where the origin of '{frames[0]}' lies: the bag does not say"
     return "# datum: the median of the first five fixes"
 
 

@@ -36,7 +36,7 @@ _STAMPED_LATE_S, _ON_ITS_WAY_S = 0.05, 0.15  # 1 sigma of the delay of a receive
 # A delay of NMEA stamps after the times in the sentences: least, most, and largest spread. Stamps of whole seconds
 # spread over a second.
 _LEAST_AFTER_S, _MOST_AFTER_S, _EVEN_S = 0.1, 1.0, 0.5
-_STAMPS = "stamps may be late: the delay is estimated with the run; set 0 where the receiver stamps with its own clock"
+_STAMPS = "stamps may be late: the delay is estimated with the run; set 0 if the receiver stamps with its own clock"
 _LONG_ON_ITS_WAY = "recorded {:.1f} s after its stamps, which fit what the IMU feels: its messages take as long, and its clock is right"
 # The longest that messages may take; relative difference up to which two delays are equal.
 _LONGEST_WAY_S, _NEAR = 3.0, 0.25

@@ -55,12 +55,12 @@ def velocity_blocks(inspection: Inspection) -> Iterator[list[str]]:
 def _why_off(twist: VelocityReport, used: VelocityReport | None) -> str | None:
     """Return why a velocity over ground is switched off; None if it is the one that is used."""
     if twist.axes is None and twist.msgtype == VECTOR:
-        return f"nothing tells that it is a velocity; {twist.why}"
+        return f"nothing shows that it is a velocity; {twist.why}"
     if twist is used:
         return None
     if filtered(twist.topic):
         return FILTERED
-    return f"true if it comes of another receiver than {used.topic if used else 'that'}; {twist.why}"
+    return f"true if it comes from another receiver than {used.topic if used else 'that'}; {twist.why}"
 
 
 def _body_velocity_block(name: str, twist: VelocityReport) -> list[str]:

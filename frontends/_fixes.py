@@ -131,8 +131,8 @@ def stamp_warning(sensor: str, stamps_ns: NDArray[np.int64]) -> list[str]:
 def height_warning(sensor: str, fixes: Sequence[GnssPosition]) -> list[str]:
     """Return a warning if fixes have no height, or 0 instead of one."""
     if len(fixes) >= _FEWEST and all(m.has_height and m.position.height_m == 0.0 for m in fixes):
-        said = f"{sensor}: all {len(fixes)} fixes have a height of 0, as of a receiver that gives none"
-        return [f"{said}: the track's height is off by what no bound includes; NaN would say so"]
+        said = f"{sensor}: all {len(fixes)} fixes have a height of 0, as from a receiver that has none"
+        return [f"{said}: the track's height is off by an amount that no bound includes; let the driver write NaN"]
     flat = sum(not m.has_height for m in fixes)
     if not flat:
         return []
@@ -193,7 +193,7 @@ class Uneven(NamedTuple):
     def said(self) -> str:
         """The unevenness in words."""
         return (
-            f"stamps are uneven by {self.stamps_s:.3f} s, as of fixes that are stamped when they come in: {self.along_m:.2f} m "
+            f"stamps are uneven by {self.stamps_s:.3f} s, as where fixes are stamped on arrival: {self.along_m:.2f} m "
             f"at {self.speed_mps:.1f} m/s"
         )
 

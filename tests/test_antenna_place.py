@@ -182,7 +182,7 @@ def test_calibration_names_it_all_the_same_and_that_the_track_has_it() -> None:
 
 def test_a_place_far_beyond_its_sigma_is_said() -> None:
     warnings = app.simulated(displaced(0.2)).solution.stats.warnings
-    assert any(w.startswith("gnss: mount.xyz_m[") and "sigmas from where it is set: add +" in w for w in warnings)
+    assert any(w.startswith("gnss: mount.xyz_m[") and "sigmas from its configured value: add +" in w for w in warnings)
 
 
 def test_what_is_to_be_added_is_in_axes_of_the_body() -> None:

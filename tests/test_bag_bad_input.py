@@ -554,7 +554,7 @@ def test_a_clock_that_ntp_sets_by_less_than_a_second_leaves_no_pose_good(
     (line,) = (w for w in recording.warnings if "no time_offset_s holds throughout" in w)
     assert line.startswith("gnss: its clock loses ")
     assert f"all of it at {utc_text(set_ns)[:19]}" in line
-    assert "take one side (--start, --duration)" in line
+    assert "use the part on one side (--start, --duration)" in line
     assert recording.clock_doubts == ((line,) if doubted else ())
 
 

@@ -295,7 +295,7 @@ def test_heights_of_zero_throughout_are_said_to_be_none(tmp_path: Path) -> None:
     for _, _, fix in items:
         fix.altitude = 0.0
     (line,) = read(tmp_path, items).warnings
-    assert line.startswith("gnss: all 400 fixes have a height of 0, as of a receiver that gives none")
+    assert line.startswith("gnss: all 400 fixes have a height of 0, as from a receiver that has none")
 
 
 @pytest.mark.parametrize("every", [1, 3])

@@ -115,7 +115,7 @@ def test_a_time_far_beyond_its_sigma_is_said(mode: str) -> None:
     run = late(0.01)
     offline = mode == "offline"
     found = app.simulated(run).solution if offline else replay(run.recording, run.config).solution
-    said = [w for w in found.stats.warnings if "sigmas from where it is set: add -" in w]
+    said = [w for w in found.stats.warnings if "sigmas from its configured value: add -" in w]
     assert all("gnss: time_offset_s is " in w for w in said)
     by_s = [float(w.split("add ")[1].split()[0]) for w in said]
     # Online it is named again once it proves twice as far off.

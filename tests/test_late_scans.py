@@ -158,7 +158,7 @@ def test_the_report_says_what_the_track_lacks_of_a_delay(share: float | None, wi
 def test_a_clock_far_beyond_its_sigma_is_said_and_no_pose_is_good(mode: Any) -> None:
     found = mode(0.02, 0.15)
     # Online it is named as soon as it is clear, and again once it is twice as far.
-    *_, said = (w for w in found.stats.warnings if "sigmas from where it is set: add -0." in w)
+    *_, said = (w for w in found.stats.warnings if "sigmas from its configured value: add -0." in w)
     assert ": time_offset_s is " in said
     assert float(said.split(": add ")[1].split(" ")[0]) == pytest.approx(-0.15, abs=0.05)
     last = found.health_reason[-1]

@@ -218,7 +218,7 @@ def test_the_first_screen_says_that_the_heading_is_off() -> None:
 @pytest.mark.parametrize("mode", ["offline", "online"])
 def test_a_time_far_beyond_its_sigma_is_said(mode: str) -> None:
     found = solved(0.03).solution if mode == "offline" else replayed(0.03)
-    said = [w for w in found.stats.warnings if "sigmas from where it is set: add -" in w]
+    said = [w for w in found.stats.warnings if "sigmas from its configured value: add -" in w]
     assert len(said) == 1
     assert "velocity: time_offset_s is " in said[0]
 

@@ -82,7 +82,7 @@ def test_of_a_parked_vessel_no_heading_is_known() -> None:
     solved = app.smooth_recording(replace(only(run.recording, fixes), imu=rest), config).solution
     assert solved.trajectory.cov is not None
     assert np.degrees(np.sqrt(solved.trajectory.cov[:, 5, 5])) == pytest.approx(103.9, abs=0.1)
-    assert any("no sensor tells it, nor does motion" in w for w in solved.stats.warnings)
+    assert any("no sensor measures it, nor does the motion show it" in w for w in solved.stats.warnings)
 
 
 def test_the_sea_is_round() -> None:

@@ -219,9 +219,9 @@ def test_a_clock_that_is_set_by_whole_seconds_is_put_right(
         read_as[name] = config, [(m.stamp_ns, m.seq) for m in recording.measurements]
         for said in (w for w in (*found.warnings, *recording.warnings) if "the clock of" in w):
             assert f"by {abs(by_s)}.00 s at {utc_text(START_NS + set_s * S + WAY_NS['/fix'])}" in said
-            assert f": {300 - 5 * set_s} of its stamps are put right" in said
-        assert sum("put right" in w for w in found.warnings) == (name == "set")
-        assert sum("put right" in w for w in recording.warnings) == (name == "set")
+            assert f": {300 - 5 * set_s} of its stamps are corrected" in said
+        assert sum("corrected" in w for w in found.warnings) == (name == "set")
+        assert sum("corrected" in w for w in recording.warnings) == (name == "set")
         assert not recording.clock_doubts
     assert read_as["set"] == read_as["right"]
 

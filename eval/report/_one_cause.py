@@ -60,7 +60,7 @@ def _place(off_m: Array) -> str:
     ahead, port = -off_m
     return (
         f"turns with the vessel: the truth is {abs(ahead):.2f} m {'ahead' if ahead > 0.0 else 'astern'} and {abs(port):.2f} m to "
-        f"{'port' if port > 0.0 else 'starboard'} of the vessel's origin, as of an antenna or a prism elsewhere, or a mount is wrong"
+        f"{'port' if port > 0.0 else 'starboard'} of the vessel's origin, as if the truth were that of an antenna or a prism elsewhere; or a mount is wrong"
     )
 
 

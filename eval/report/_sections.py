@@ -160,7 +160,7 @@ def calibration(data: ReportData) -> str:
     )
     head = "<tr><th>setting</th><th>configured</th><th>change</th><th>1 sigma</th><th>meaning</th></tr>"
     return (
-        note("What the run tells about lever arms, mounts, time stamps and IMU noise. Nothing of it was applied.")
+        note("What the run shows about lever arms, mounts, time stamps and IMU noise. None of it was applied.")
         + (f"<ul>{wrong}</ul>" if wrong else "")
         + f'<div class="scroll"><table class="reason">{head}{rows}</table></div>'
     )
@@ -175,5 +175,5 @@ def solver(solution: Solution) -> str:
     return (
         f"<p>{s.states} states, {s.factors} factors, {s.passes} passes, {s.iterations} iterations; "
         f"{'converged' if s.converged else 'NOT converged'}. Cost {s.cost:.0f}, expected {s.expected_cost:.0f} "
-        f"(ratio {s.cost / max(s.expected_cost, 1.0):.2f}; near 1 where the noise is configured right, below where it is configured too large).</p>{events}"
+        f"(ratio {s.cost / max(s.expected_cost, 1.0):.2f}; near 1 where the noise is configured correctly, below 1 where it is configured too large).</p>{events}"
     )

@@ -20,11 +20,11 @@ from graphloc.time import stamps_of
 from graphloc.trajectory import Trajectory
 
 _BL = (
-    "Grey: as printed, of BL's own recordings, with GNSS as truth and noise put on it. Below: this run, in the same form; "
+    "Grey: as printed, from BL's own recordings, with GNSS as truth and noise added to it. Below: this run, in the same form; "
     "another vessel or harbour, so the two are not to be subtracted. The BL EKF below is their filter on this run."
 )
 _DIGERUD = (
-    "Grey: as printed, of D's own recordings with RTK GNSS as truth. Below: this run. Error: the distance to the nearest tag "
+    "Grey: as printed, from D's own recordings with RTK GNSS as truth. Below: this run. Error: the distance to the nearest tag "
     "within which 95 % of horizontal errors are below 0.10 m, from the first sighting on. Range: the true distance of the "
     "farthest sighting. Ambiguity: of two poses that a sighting allows, how often the run took the one that fits the image less."
 )

@@ -139,7 +139,7 @@ def _coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
     trust, why = Trust.YES, ""
     if covered < _COVERED and _truth_on_another_clock(data):
         trust = Trust.WITH_CARE
-        why = ". That says nothing of the track: the truth is on another clock (see the warnings)"
+        why = ". That says nothing about the track: the truth is on another clock (see the warnings)"
     elif covered < _NOT_COVERED:
         trust = Trust.NO
         why = (
@@ -237,7 +237,7 @@ def _far_from_fixes(data: ReportData, solution: Solution) -> Iterator[Reason]:
         else:
             yield Reason(
                 trust=Trust.NO,
-                text=f"{text}: these are wrong, or what the track follows instead (a survey, an image, the datum); this run does not "
+                text=f"{text}: either these are wrong, or what the track follows instead (a survey, an image, the datum); this run does not "
                 "tell which.",
             )
 

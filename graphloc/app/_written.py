@@ -70,7 +70,7 @@ def truth_statement(run: Run) -> str:
         truth = run.recording.truth
         named = run.config.truth or "given with the recording"
         begun = bool(run.filters) and starts_at_truth(run.recording)
-        started = " The EKFs are started at it, as BL started theirs; graphloc is not." if begun else ""
+        started = " The EKFs start from it, as BL's did; graphloc does not." if begun else ""
         poses = "poses" if truth.headed else "positions without a heading"
         return f"Truth: {named}, {len(truth)} {poses} over {_lasts(truth, run.solution.trajectory)}; it was not fused.{started}"
     if run.held:

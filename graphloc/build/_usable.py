@@ -26,7 +26,7 @@ def usable_imu(recording: Recording, config: VesselConfig, kind: str) -> ImuSeri
     if not any(sensor.kind == kind and sensor.enabled for sensor in config.sensors.values()):
         raise SolveError(
             f"{recording.source}: no enabled sensor of kind {kind} in vessel.yaml, and accelerations and rates (50 Hz or "
-            "more) are what a track is made of: name their topic, or record them"
+            "more) are what a track is computed from: name their topic, or record them"
         )
     if recording.imu is None or len(recording.imu) < 10:
         lost = recording.lost(config.of_kind(kind))

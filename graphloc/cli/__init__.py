@@ -73,7 +73,7 @@ def main() -> None:
         path = error.ctx.command_path if getattr(error, "ctx", None) else "graphloc"
         _fail(f"{text.rstrip('.')}; see {path} --help")
     except typer.Abort:
-        _fail("given up: nothing was done")
+        _fail("aborted: nothing was done")
     if code == _INTERRUPTED:
         _interrupted("nothing was left half-written")
     sys.exit(code or 0)

@@ -24,11 +24,13 @@ def sensors() -> None:
 
 
 def show_config(
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="A vessel.yaml to check.")] = None,
-    docs: Annotated[bool, typer.Option("--docs", help="Print docs/configuration.md.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON, not as YAML.")] = False,
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="The vessel.yaml to check and print.")] = None,
+    docs: Annotated[
+        bool, typer.Option("--docs", help="Print the reference of all keys (docs/configuration.md).")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of YAML.")] = False,
 ) -> None:
-    """Print the effective configuration of a vessel.yaml, as one, or the reference of all keys."""
+    """Print the effective configuration of a vessel.yaml, all defaults filled in; without --config, the reference of all keys."""
     from ruamel.yaml import YAML
 
     from graphloc._config_docs import render

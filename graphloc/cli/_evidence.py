@@ -33,7 +33,7 @@ def summary(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Put the numbers of finished runs into one table: a row per run, the mean and the worst."""
+    """Put the numbers of finished runs into one table: one row per run, the mean and the worst."""
     from graphloc.eval import summary as summaries
 
     read = summaries.read_runs(runs)

@@ -14,7 +14,7 @@ from graphloc.cli._shared import FolderOptions, HoldOutOption, JobsOption, SeedO
 
 
 def ablate(options: FolderOptions, hold_out: HoldOutOption = None, jobs: JobsOption = None) -> None:
-    """Smooth a run without each sensor in turn: what each contributes, and whether one contradicts the rest."""
+    """Smooth a run without each sensor in turn, to see what each contributes and whether one contradicts the rest."""
     from graphloc import ablations
     from graphloc.eval import ablation_page as page
     from graphloc.eval.holdout import HoldOut
@@ -40,7 +40,7 @@ def drill(
     seed: SeedOption = 0,
     jobs: JobsOption = None,
 ) -> None:
-    """Inject failures (outages, jumps, false matches) into a run: do smoother, online mode and EKFs recover?"""
+    """Inject failures (outages, jumps, false matches) into a run, to see whether smoother, online mode and EKFs recover."""
     from graphloc import drills
     from graphloc.eval.drill import page
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # these load gtsam and more, which would delay --help
 
 
 class Stopped(GraphlocError):
-    """Ctrl-C; the message says what is kept of the work so far."""
+    """Ctrl-C was pressed; the message says what is kept of the work so far."""
 
 
 BagArgument = Annotated[list[Path], typer.Argument(help="A ROS 1 or ROS 2 bag; give all files of a split one.")]
@@ -42,7 +42,7 @@ HoldOutOption = Annotated[
     str | None,
     typer.Option(
         "--hold-out",
-        help="Withhold GNSS fixes and predict them: every:N, or gaps:COUNTxSECONDS, which lack GNSS velocities, too.",
+        help="Withhold GNSS fixes and predict them: every:N, or gaps:COUNTxSECONDS (GNSS velocities in the gaps are withheld, too).",
     ),
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output.")]
@@ -51,7 +51,7 @@ RerunOption = Annotated[
     Path | None, typer.Option("--rerun", help="Also write the run for the rerun viewer: out.rrd (docs/rerun.md).")
 ]
 LagOption = Annotated[
-    float, typer.Option("--lag", min=1.0, help="Length of the sliding window, s; a measurement may come this late.")
+    float, typer.Option("--lag", min=1.0, help="Length of the sliding window, s; measurements may arrive this late.")
 ]
 JobsOption = Annotated[int | None, typer.Option("--jobs", min=1, help="Parallel processes; default: one per core.")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Random seed: the same seed gives the same run.")]

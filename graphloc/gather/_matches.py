@@ -131,8 +131,8 @@ def turned_heading(sensor: str, turns: Sequence[tuple[float, float]]) -> list[st
     if sigma > _TOLD_RAD or abs(turn) < _TURNED_SIGMAS * sigma:
         return []
     line = (
-        f"{sensor}: its matches turn the heading by {np.degrees(turn):.1f} deg (counter-clockwise) from what the rest of the run tells to "
-        f"{np.degrees(sigma):.1f} deg (1 sigma); bounds include neither a LiDAR's mount nor a heading sensor that is off by so much"
+        f"{sensor}: its matches turn the heading by {np.degrees(turn):.1f} deg (counter-clockwise) from what the rest of the run shows to "
+        f"{np.degrees(sigma):.1f} deg (1 sigma); the bounds allow for neither a LiDAR's mount nor a heading sensor that is off by that much"
     )
     return [line]
 

@@ -208,4 +208,4 @@ def too_steady(name: str, stated: Any, taken: Any) -> str:
     ]
     if not changed:
         return ""
-    return f"{name}: its biases change more than configured (it warms up, or is a cheap one; a scale or an axis that is off looks so, too): {'; '.join(changed)}"
+    return f"{name}: its biases change more than configured (it is warming up, or a cheap IMU; a wrong scale or a misaligned axis looks the same): {'; '.join(changed)}"

@@ -32,7 +32,7 @@ def slow_error_warning(sensor: str, left_out: SlowProcess | None, *, without_hei
     said = list[str]()
     if left_out is not None and left_out.sigma[0] >= _SMALL_M:
         said.append(
-            f"{sensor}: no second sensor measures position or velocity, so its drift (multipath) cannot be told from motion; "
+            f"{sensor}: no second sensor measures position or velocity, so its drift (multipath) cannot be told apart from motion; "
             f"the bounds include {left_out.sigma[0]:.2g} m (1 sigma) for it: slow_error.horizontal_sigma_m (RTK: 0.03)"
         )
     if without_height:
@@ -72,7 +72,7 @@ def scale_warning(sensor: str, stated: SensorConfig, taken: SensorConfig) -> lis
     cure = ", ".join(
         [f"{key}: {getattr(taken, key):.2g}" for key in floors] + [f"{key}: {getattr(taken, key):.1f}" for key in times]
     )
-    said = f"{sensor}: its measurements scatter more than they state; this run takes the following, which is to be set unless its mount or stamps are wrong: {cure}"
+    said = f"{sensor}: its measurements scatter more than they state; this run uses the following, which should be set unless its mount or stamps are wrong: {cure}"
     return [Graded(said, f"sigmas of {sensor}", max(times.values()))]
 
 
@@ -120,4 +120,4 @@ def late_far_off(name: str, slow: SlowProcess | None, late_s: float) -> list[str
 
 
 def _add_to(name: str, key: str, by: float, off: float) -> str:
-    return f"{name}: {key} is {off:.1f} sigmas from where it is set: add {by:+.3f} to it"
+    return f"{name}: {key} is {off:.1f} sigmas from its configured value: add {by:+.3f} to it"

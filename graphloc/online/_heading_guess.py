@@ -49,7 +49,7 @@ class HeadingGuess:
         why, said = known.doubt(newest_ns), self._said
         if check.confirmed or (not why and self.measured(first_ns, newest_ns)):
             self._said = False
-            confirmed = Event("the motion confirms the heading: it is no guess any more", warns=False)
+            confirmed = Event("the motion confirms the heading: it is no longer a guess", warns=False)
             return None, [confirmed] if said and check.confirmed else []
         self._said = said or bool(why)
         return known, [Event(why, heading_guessed=True)] if why and not said else []

@@ -117,7 +117,7 @@ class SensorClock:
         if len(self._ahead_ns) < _FEWEST or _wrong(usual_ns + self.set_ns) >= _wrong(usual_ns):
             return None
         m, self.set_ns = replace(m, stamp_ns=m.stamp_ns + self.set_ns), 0
-        said = f"{m.sensor}: its clock was set again, unseen: its stamps are used as they come from {utc_text(m.stamp_ns)} on"
+        said = f"{m.sensor}: its clock was set again, unnoticed: its stamps are used as they come from {utc_text(m.stamp_ns)} on"
         return PutRight([*self._begin_anew(), m], said)
 
     def _of_another_clock(self, sensor: str, lag_s: float) -> str:
@@ -157,7 +157,7 @@ class SensorClock:
         said = f"{found[0].sensor}: its clock was set {'forward' if whole_s > 0 else 'back'} by {abs(whole_s)} s at {utc_text(found[0].stamp_ns)}"
         if abs(whole_s) == GPS_AHEAD_S:
             said += f", as from {'UTC to GPS time' if whole_s > 0 else 'GPS time to UTC'}"
-        return PutRight(found, f"{said}: its stamps are put right by that from there on")
+        return PutRight(found, f"{said}: its stamps are corrected by that from then on")
 
 
 def _wrong(ahead: float) -> float:

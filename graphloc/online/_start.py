@@ -249,13 +249,13 @@ def _heading(
     sigma = min(float(np.sqrt(max(linear_var, result.heading_var[-1]))), ANY_HEADING_RAD)
     last_ns, drift_radps = int(problem.timeline.stamps_ns[-1]), _vertical_bias_sigma(problem.R_body_imu, result)
     if setup.config.start.heading_deg is not None and not _measured(setup, recording, datum):
-        why = "the heading is a guess: only `start.heading_deg` told it, and the gyroscope has carried it since"
+        why = "the heading is a guess: it comes from `start.heading_deg` alone, and the gyroscope has carried it since"
         return UnmeasuredHeading(why=why, since_ns=last_ns, sigma_rad=sigma, drift_radps=drift_radps)
     if told and not (result.headings > 1 or sigma > DOUBTFUL_RAD):
         return None
-    found = f"the motion so far tells it to {np.degrees(sigma):.0f} deg (1 sigma)"
+    found = f"the motion so far shows it to {np.degrees(sigma):.0f} deg (1 sigma)"
     if not told:
-        found = "it has not gone far enough for its motion to tell it"
+        found = "it has not gone far enough for its motion to show it"
     elif result.headings > 1:
         found += f", {result.headings} candidates explain it"
     if told and _span_s(result) < _LONGEST_WAIT_S:

@@ -213,7 +213,7 @@ def _add_others(result: BatchResult, cov: Array) -> list[str]:
     sure = np.sqrt(var.min())
     if sure < _SHOWN_RAD:
         return []
-    said = f"the heading is a guess: no sensor tells it, and the motion only to {np.degrees(sure):.0f} deg (1 sigma) at best"
+    said = f"the heading is a guess: no sensor measures it, and the motion shows it only to {np.degrees(sure):.0f} deg (1 sigma) at best"
     return [
         f"{said}; turn or accelerate more, add a heading sensor, wheels or a log (body_velocity), or set start.heading_deg"
     ]
@@ -229,7 +229,7 @@ def _add_guess(result: BatchResult, cov: Array) -> list[str]:
         return []
     widen_heading(cov, cov[:, 5, 5] + ANY_HEADING_RAD**2)
     return [
-        "the heading is a guess: no sensor tells it, nor does motion; move, add a heading sensor or set start.heading_deg"
+        "the heading is a guess: no sensor measures it, nor does the motion show it; move, add a heading sensor or set start.heading_deg"
     ]
 
 

@@ -260,7 +260,7 @@ def _headings(
             ("heading from " + ", ".join(sources)),
         )
     if moved_s is None:
-        return (0.0,), np.pi, window, "heading unknown: no sensor tells it and the vessel does not move"
+        return (0.0,), np.pi, window, "heading unknown: no sensor measures it and the vessel does not move"
     course = np.arange(8) * np.pi / 4.0
     return (
         tuple(wrap_angle(np.asarray(course, dtype=np.float64))),

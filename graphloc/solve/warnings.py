@@ -202,7 +202,7 @@ def _wandering_biases(problem: Problem, result: BatchResult) -> list[str]:
     ):
         if times > _WANDERS_SAID:
             said = f"{problem.imu.sensor}: a bias of its {what} changes within {WANDERS_S:.0f} s by {times:.1f} sigmas of what {key} allows"
-            cure = f"it warms up, or is a cheap one; set {key}: {float(f'{times * getattr(config, key):.2g}'):g} or more, until this line is gone: else the bounds of {bounds} are too small"
+            cure = f"it is warming up, or a cheap IMU; set {key}: {float(f'{times * getattr(config, key):.2g}'):g} or more, until this warning is gone; otherwise the bounds of {bounds} are too small"
             warnings.append(Graded(f"{said}: {cure}", f"wandering {what}", float(times)))
     return warnings
 
