@@ -139,6 +139,7 @@ def slow(config: GnssConfig) -> SlowProcess | None:
         time_constant_s=np.full(3, s.time_constant_s),
         jumps=s.jumps,
         far=("east", "north") if s.jumps else (),
+        follows=("up",) if s.jumps else (),
         needs_company=s.enabled is None,
         anew_after_s=_LOST_S if config.fixes == "rtk" else math.inf,
     )

@@ -256,6 +256,7 @@ class SlowProcess:
             Student's t: a mount may be turned by any angle.
         jumps: whether a step may be a jump; steps then have a robust loss.
         far: axes that, together, may stay at a level many sigmas from zero, as after a jump; their priors then have Cauchy tails.
+        follows: axes that step, too, where the far axes jump, by an unknown amount: a wrong fix is wrong in height as well.
         stepped: axes that a step of the measurements moves, which the gyroscope does not show (`signals/heading_steps.py`).
         needs_company: whether it is estimated only if a second sensor can tell it from motion. If none can, it is left out of the
             graph, and its size is added to the bounds.
@@ -272,6 +273,7 @@ class SlowProcess:
     no_tails: tuple[str, ...] = ()
     jumps: bool = False
     far: tuple[str, ...] = ()
+    follows: tuple[str, ...] = ()
     stepped: tuple[str, ...] = ()
     needs_company: bool = False
     anew_after_s: float = math.inf
@@ -299,7 +301,7 @@ class SlowProcess:
     @property
     def jump_axes(self) -> NDArray[np.bool_]:
         """Which axes (k,) a jump or a step seen in the measurements moves."""
-        return np.array([axis in self.far or axis in self.stepped for axis in self.axes])
+        return np.array([axis in (*self.far, *self.follows, *self.stepped) for axis in self.axes])
 
     def after(self, dt_s: float) -> tuple[Array, Array]:
         """Return the factors (k,) by which the state has decayed after `dt_s`, and the variances (k,) of the noise added since."""

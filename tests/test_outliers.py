@@ -40,6 +40,7 @@ from graphloc.solve._first_solution import first_solution
 from graphloc.solve._grow import grow
 from graphloc.solve._jumps import jumps_in, with_jumps_off_track
 from graphloc.solve.stretch import StretchStep, solve_stretch
+from graphloc.trajectory import bounds_95
 from tests.slowly import simulate_slowly, with_few_states
 
 _FINE_FIXES = Scenario(gnss_sigma_m=0.05, gnss_reported_sigma_m=0.21, imu_hz=50.0)
@@ -502,6 +503,24 @@ def test_a_jump_of_the_only_receiver_is_not_followed_where_the_imu_contradicts_i
     assert any("position jump of 12 m" in w and "treated as its error" in w for w in found.stats.warnings)
 
 
+@pytest.mark.parametrize("online", [False, True])
+def test_the_height_of_fixes_that_have_jumped_is_not_believed(*, online: bool) -> None:
+    """A wrong RTK fix, 2 m off and 0.5 m too high: its place was not followed, but its height was, in bounds of decimetres."""
+    rtk_error = SlowErrorConfig(horizontal_sigma_m=0.03, vertical_sigma_m=0.06)
+    run, recording, config = jumping_alone(
+        5.0, (15.0, 30.0), 40.0, off_m=2.0, sigma_m=0.02, slow=rtk_error, rate_hz=2.5, high_m=0.5
+    )
+    found = (replay if online else app.smooth_recording)(recording, config).solution.trajectory
+    truth = run.truth.at(found.stamps_ns)
+    assert found.cov is not None
+    bound_m = bounds_95(found.cov)
+    off_m = np.abs(found.p_world_m - truth.p_world_m)
+    assert (off_m[:, 2] < bound_m[:, 1]).mean() > 0.95
+    at_s = (found.stamps_ns - run.truth.stamps_ns[0]) * 1e-9
+    assert off_m[at_s < 18.0, 2].max() < 0.25  # online it is followed slowly, in its bounds
+    assert np.median(bound_m[at_s < 14.0, 1]) < 0.3  # not for want of a bound
+
+
 def test_a_jump_between_noisy_fixes_is_seen_where_the_track_leaves_them() -> None:
     """10 m for 14 s, and no step that stands out among the others: it was followed, and outside the bounds for half of the run."""
     run, recording, config = jumping_alone(1.0, (13.0, 27.0), 40.0, off_m=10.0, sigma_m=0.8)
@@ -870,8 +889,9 @@ def jumping_alone(
     sigma_m: float = Scenario().gnss_sigma_m,
     slow: SlowErrorConfig | None = None,
     rate_hz: float = 1.25,
+    high_m: float = 0.0,
 ) -> tuple[SimulatedRun, Recording, VesselConfig]:
-    """A run whose position one receiver measures, `off_m` off to the north from one second to another."""
+    """A run whose position one receiver measures, `off_m` off to the north from one second to another, and `high_m` too high."""
     scenario = Scenario(
         path="loops", duration_s=duration_s, noise="clean", pose_hz=0.0, compass_hz=1.0, imu_hz=50.0, gnss_hz=gnss_hz,
         gnss_sigma_m=sigma_m,
@@ -885,7 +905,8 @@ def jumping_alone(
     def struck(m: Measurement) -> Measurement:
         if not isinstance(m, GnssPosition) or not off_s[0] <= (m.stamp_ns - begin_ns) * 1e-9 < off_s[1]:
             return m
-        return replace(m, position=Geodetic(m.position[0] + off_m / 111_300.0, *m.position[1:]))
+        north_deg, east_deg, height_m = m.position
+        return replace(m, position=Geodetic(north_deg + off_m / 111_300.0, east_deg, height_m + high_m))
 
     recording = run.recording.changed(struck)
     return run, recording, with_few_states(run.config.model_copy(update={"sensors": sensors}), rate_hz)

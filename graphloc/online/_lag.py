@@ -203,7 +203,18 @@ class Lag:
         share = self._agreement.wrong_level(self.newest.stamp_ns)
         if share:
             cov = cov + share * sum((off for s, off in self._off_squares() if s.left_out is not None), np.zeros((3, 3)))
-        return mean, cov
+        return mean, cov + np.diag([0.0, 0.0, self._height_var()])
+
+    def _height_var(self) -> float:
+        """Return what is added to the variance of the height, m^2, while the only receiver is far off.
+
+        Its height is wrong by about as much as its place, but is followed, because nothing else measures the height.
+        """
+        far = self._agreement.unlikely(self.problem.config.receiver_of)
+        off = self._off_squares() if far else ()
+        return sum(
+            float(np.trace(o)) for s, o in off if s.left_out is not None and not s.without_height and s.name in far
+        )
 
     @property
     def contradicted(self) -> Array:

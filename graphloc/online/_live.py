@@ -281,7 +281,10 @@ class LiveStream:
         found = [j for j in self.jumps if after_ns < j.until_ns and j.after_ns <= until_ns]
         if self.slow is None or not found or not self.slow.jump_axes.any():
             return 0.0, None
-        moved, step = self.slow.jump_axes, np.zeros(len(self.slow.axes))
+        moved = np.array(
+            [axis in (*self.slow.far, *self.slow.stepped) for axis in self.slow.axes]
+        )  # by as much as seen
+        step = np.zeros(len(self.slow.axes))
         added = np.array([j.parts for j in found]) / self.slow.scale[moved]
         step[moved] = added[[j.after_ns > after_ns and j.at_once for j in found]].sum(axis=0)
         return float(np.linalg.norm(added, axis=1).max()), step
