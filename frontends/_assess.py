@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import GnssConfig, SlowErrorConfig
 from graphloc.frames import Array, Datum, Geodetic, wrap_angle
-from graphloc.frontends import _clock
+from graphloc.frontends import _clock, _order
 from graphloc.frontends._fixes import RTK_SIGMA_M, radians_warning, scatter_m, stored, stored_warning, uneven
 from graphloc.frontends._reports import GnssReport, PartOfFixes, TopicReport, Vec, of_nmea
 from graphloc.frontends._sanity import far_fixes_of, lone_fixes
@@ -115,7 +115,7 @@ def topic_report(stream: TopicData, count: int) -> TopicReport:
     steps = np.diff(stamps)
     # Messages out of order leave no gap, and count in the rate: so steps of the sorted stamps. A clock that was set
     # back would interleave two parts.
-    ahead = np.diff(stamps if _clock.set_backs(stamps) else np.sort(stamps))
+    ahead = np.diff(stamps if _order.set_backs(stamps) else np.sort(stamps))
     ahead = ahead[ahead > 0] / NS_PER_S
     usual = float(np.median(ahead)) if len(ahead) else None
     latency = np.percentile(logs - stamps, [5, 50, 95]) / NS_PER_S
@@ -151,7 +151,7 @@ def sane(stream: TopicData, finite: slice | None = None) -> NDArray[np.intp]:
         finite: columns of `rows` that must be finite; None: none.
     """
     good = np.flatnonzero(~_clock.clock_jumps(stream.stamps_ns, stream.logs_ns))
-    keep = good[_clock.longest_increasing(stream.stamps_ns[good])]
+    keep = good[_order.longest_increasing(stream.stamps_ns[good])]
     if finite is None or not len(keep):
         return keep
     return keep[np.isfinite(stream.rows[keep, finite]).all(axis=1)]
@@ -178,7 +178,7 @@ def without_drift(streams: Sequence[TopicData]) -> list[TopicData]:
 
 def evenly(imu: TopicData) -> TopicData:
     """Return an IMU's stream, with samples that were stamped in bursts laid out evenly."""
-    return imu.stamped(_clock.evened(imu.stamps_ns, imu.rows[:, :6]))
+    return imu.stamped(_order.evened(imu.stamps_ns, imu.rows[:, :6]))
 
 
 def on_one_clock(streams: Sequence[TopicData]) -> list[TopicData]:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from graphloc.config import STANDARD_GRAVITY_MPS2, ImuConfig
 from graphloc.frames import Array, rotation_from_rpy_deg, rpy_from_rotation, wrap_angle, yaw_from_rotation
-from graphloc.frontends import _clock
+from graphloc.frontends import _clock, _order
 from graphloc.frontends._assess import MeasuredMotion, attitudes, vec
 from graphloc.frontends._assess_mount import (
     ImuEvidence,
@@ -64,7 +64,7 @@ _QUIET_S, _STANDS_S = 2, 1.5
 def samples_of(imu: TopicData) -> tuple[NDArray[np.intp], list[str]]:
     """Return the indices of usable samples, sorted by stamp, and warnings on frozen samples, which are left out."""
     good = np.flatnonzero(~_clock.clock_jumps(imu.stamps_ns, imu.logs_ns))
-    keep = good[_clock.in_order_or_late(imu.stamps_ns[good])]
+    keep = good[_order.in_order_or_late(imu.stamps_ns[good])]
     keep = keep[np.argsort(imu.stamps_ns[keep], kind="stable")]
     bad = frozen_samples(imu.stamps_ns[keep], imu.rows[keep, :6] if len(keep) else np.zeros((0, 6)))
     return keep[~bad], frozen_imu_warning(imu.topic, imu.stamps_ns[keep], bad)

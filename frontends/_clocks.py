@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from graphloc.frontends import _clock
+from graphloc.frontends import _clock, _order
 from graphloc.frontends._readings import Readings
 
 
@@ -17,7 +17,7 @@ class _SensorClock(NamedTuple):
     """
 
     readings: Readings
-    logs: _clock.Stamps
+    logs: _order.Stamps
     gain: _clock.Gain
     latency_s: float
     step: _clock.ClockStep | None

@@ -18,12 +18,12 @@ from graphloc.frontends._clock import (
     leaps,
     pace,
     recorder_set,
-    refuse_woven,
     steady_logs,
     step,
     usual_latency_s,
     without_leaps,
 )
+from graphloc.frontends._order import refuse_woven
 from graphloc.frontends._reports import bare_topic
 from graphloc.frontends._streams import Sentences, read_streams
 from graphloc.frontends._tf import Pose, StaticTree

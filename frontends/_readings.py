@@ -21,7 +21,7 @@ from graphloc.config import (
     VesselConfig,
 )
 from graphloc.frames import Array
-from graphloc.frontends import _clock, _fixes, _sanity
+from graphloc.frontends import _clock, _fixes, _order, _sanity
 from graphloc.frontends._references import Reference
 from graphloc.frontends._rejections import Rejection, rejected
 from graphloc.frontends._turns import SCATTERED, scattered
@@ -159,10 +159,10 @@ def reject_jumps(sensors: Sequence[Readings], warnings: list[str]) -> list[Ledge
     stamps = np.concatenate([r.stamps() for r in sensors]) if sensors else np.zeros(0, dtype=np.int64)
     if len(stamps) == 0:
         return rows
-    first, last = _clock.busiest_section(stamps)
+    first, last = _order.busiest_section(stamps)
     apart = rejected(
         f"outside the busiest part of the run ({utc_text(first)} to {utc_text(last)}): "
-        f"no sensor says anything for over {_clock.HOLE_LIMIT_S:.0f} s between"
+        f"no sensor says anything for over {_order.HOLE_LIMIT_S:.0f} s between"
     )
     for readings in sensors:
         rows += _drop(readings, (readings.stamps() < first) | (readings.stamps() > last), apart, warnings)
@@ -182,8 +182,8 @@ def reject_set_back(sensors: Sequence[Readings], beside: Sequence[Reference], wa
     """
     for imu in (r for r in sensors if r.config.kind == "imu"):
         stamps, logs = imu.stamps(), imu.logs()
-        _clock.refuse_woven(imu.config.topic, stamps, logs, imu.values, imu.files)
-        cuts = _clock.set_backs(stamps)
+        _order.refuse_woven(imu.config.topic, stamps, logs, imu.values, imu.files)
+        cuts = _order.set_backs(stamps)
         if not cuts:
             continue
         edges = [0, *cuts, len(stamps)]
@@ -219,7 +219,7 @@ def imu_series(readings: Readings, warnings: list[str]) -> tuple[ImuSeries | Non
     """
     assert isinstance(readings.config, ImuConfig)
     _even_out(readings, warnings)
-    bad = ~_clock.in_order_or_late(readings.stamps())
+    bad = ~_order.in_order_or_late(readings.stamps())
     rows = _drop(readings, bad, rejected("repeated or backward stamp"), warnings)
     readings.sort()
     rows += _drop_wrong(readings, warnings)
@@ -249,7 +249,7 @@ def _imu_values(readings: Readings) -> Array:
 def _even_out(readings: Readings, warnings: list[str]) -> None:
     """Correct the stamps of samples that were stamped in bursts, in place: they are laid out evenly."""
     stamps = readings.stamps()
-    even = _clock.evened(stamps, _imu_values(readings))
+    even = _order.evened(stamps, _imu_values(readings))
     if even is not stamps:
         readings.stamps_ns[:] = even.tolist()
         said = "they are laid out evenly between them; `graphloc stream` cannot do that: fix the driver"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphloc.frames import Array
-from graphloc.frontends import _clock
+from graphloc.frontends import _order
 from graphloc.frontends._standard import pose_of
 from graphloc.frontends.decode import MOST_DISTANCE_M, MOST_SPEED_MPS
 from graphloc.recording import SpeedSeries
@@ -63,7 +63,7 @@ def true_trajectory(item: Reference, offset_s: float, warnings: list[str]) -> Tr
         poses = [(s, p, np.eye(3), m) for s, p, _, m in poses]
     good = [(s, p, R, m) for s, p, R, m in poses if R is not None and (np.abs(p) <= MOST_DISTANCE_M).all()]
     stamps = np.array([s for s, _, _, _ in good], dtype=np.int64)
-    keep = np.flatnonzero(_clock.longest_increasing(stamps))
+    keep = np.flatnonzero(_order.longest_increasing(stamps))
     if len(keep) < item.count:
         warnings.append(f"{item.topic}: {item.count - len(keep)} truth messages left out (stamp or pose not usable)")
     if len(keep) < 2:
@@ -97,7 +97,7 @@ def check_speed(item: Reference) -> SpeedSeries | None:
     """Return the forward speeds of an odometry topic, with increasing stamps; None if none is usable."""
     stamps = np.array(item.stamps_ns, dtype=np.int64)
     speed = np.array([float(m.twist.twist.linear.x) for m in item.messages])
-    keep = np.flatnonzero(_clock.longest_increasing(stamps))
+    keep = np.flatnonzero(_order.longest_increasing(stamps))
     keep = keep[np.abs(speed[keep]) <= MOST_SPEED_MPS]
     if len(keep) == 0:
         return None

@@ -23,8 +23,8 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Reader1
 
 from graphloc.errors import InputError
-from graphloc.frontends._clock import refuse_set_back
 from graphloc.frontends._open import HINTS, BagOpener, Opened, left_beside, text_of
+from graphloc.frontends._order import refuse_set_back
 from graphloc.frontends._recover import suffix_of
 from graphloc.frontends._types import MessageTypes
 from graphloc.frontends.part import BagPart, Bags, recording_times

@@ -13,7 +13,7 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 
 from graphloc.config import VesselConfig
 from graphloc.frontends import bag, inspect
-from graphloc.frontends._clock import refuse_set_back
+from graphloc.frontends._order import refuse_set_back
 from graphloc.frontends._types import MessageTypes
 from graphloc.frontends.source import Bag, RawMessage, TopicSummary
 from graphloc.recording import Recording

@@ -15,7 +15,8 @@ from rosbags.rosbag1 import Writer
 from scipy.spatial.transform import Rotation
 
 from graphloc.errors import InputError
-from graphloc.frontends._clock import longest_increasing, steady_logs
+from graphloc.frontends._clock import steady_logs
+from graphloc.frontends._order import longest_increasing
 from graphloc.frontends._sanity import far_fixes_of, turns_gravity
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import draft_config, inspect_bag

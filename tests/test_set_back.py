@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from graphloc.errors import InputError
-from graphloc.frontends._clock import set_backs
+from graphloc.frontends._order import set_backs
 from graphloc.frontends.bag import read_recording
 from graphloc.frontends.inspect import inspect_bag
 from graphloc.frontends.part import BagPart
