@@ -24,7 +24,8 @@ from graphloc.factors.body_velocity import residuals
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._readings import Readings
 from graphloc.frontends._rejections import Rejection
-from graphloc.frontends.bag import _along_fewer, read_recording
+from graphloc.frontends._run_warnings import _along_fewer
+from graphloc.frontends.bag import read_recording
 from graphloc.frontends.decode import DECODERS
 from graphloc.frontends.lines import Trouble, parse
 from graphloc.frontends.msgtypes import NUMBERS, VECTOR

@@ -8,7 +8,7 @@ from graphloc.config import GnssConfig, VelocityConfig
 from graphloc.frames import Array, Datum, Geodetic
 from graphloc.frontends._exchanged import exchanged_warnings
 from graphloc.frontends._readings import Readings
-from graphloc.frontends.bag import _motions_of_fixes
+from graphloc.frontends._run_warnings import _motions_of_fixes
 from graphloc.measurements import GnssPosition, GnssVelocity
 
 DATUM = Datum(Geodetic(59.3, 18.1, 20.0))

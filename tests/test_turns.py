@@ -16,6 +16,7 @@ from graphloc.errors import InputError
 from graphloc.eval.simulate import Scenario, SimulatedRun, simulate
 from graphloc.frames import Array, wrap_angle
 from graphloc.frontends._assess import courses_of_fixes
+from graphloc.frontends._run_warnings import _turn_warnings
 from graphloc.frontends._turns import (
     Yaws,
     pose_turn_warning,
@@ -26,7 +27,6 @@ from graphloc.frontends._turns import (
     wander_deg,
     wander_warning,
 )
-from graphloc.frontends.bag import _turn_warnings
 from graphloc.measurements import CompassHeading, GnssPosition, ImuSeries
 from graphloc.time import stamps_of
 from tests.bagfactory import START_NS, Item, Messages, S
