@@ -211,9 +211,7 @@ def uneven(stamps_ns: NDArray[np.int64], p_m: Array) -> Uneven | None:
     steps = np.diff(t)
     if len(steps) < _ENOUGH:
         return None
-    usual = float(np.median(steps))
-    steady = np.abs(steps - usual) < _STEADY * usual
-    good = steady[:-2] & steady[1:-1] & steady[2:]
+    good = _three_usual(steps, float(np.median(steps)), _STEADY)
     if good.sum() < _ENOUGH:
         return None
     thirds = np.diff(t, n=3)[good]
@@ -226,14 +224,19 @@ def uneven(stamps_ns: NDArray[np.int64], p_m: Array) -> Uneven | None:
     return Uneven(float(white_noise_of_thirds(thirds)), speed)
 
 
+def _three_usual(steps: Array, usual: float, share: float) -> NDArray[np.bool_]:
+    """Return which third differences (N - 2,) span three of N steps that are all usual, to within a share of that."""
+    even = np.abs(steps - usual) < share * usual
+    return np.asarray(even[:-2] & even[1:-1] & even[2:])
+
+
 def scatter_m(stamps_ns: NDArray[np.int64], p_m: Array) -> float | None:
     """Return the white noise of positions (N, 2), m, 1 sigma of the worst axis; None of few, or if it may be motion."""
     steps = np.diff(stamps_ns) / NS_PER_S
     if len(steps) < _FEWEST:
         return None
     usual = float(np.median(steps))
-    even = np.abs(steps - usual) < _EVEN * usual
-    good = even[:-2] & even[1:-1] & even[2:]
+    good = _three_usual(steps, usual, _EVEN)
     if usual > _SLOW_S or good.sum() < _FEWEST:
         return None
     thirds = np.diff(p_m, n=3, axis=0)[good]
