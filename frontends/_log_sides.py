@@ -20,7 +20,7 @@ from scipy.special import stdtrit
 
 from graphloc.frames import Array, rotation_from_rpy_deg
 from graphloc.frontends._assess import sane
-from graphloc.frontends._mount_yaw import FEWEST, HALF_S, STEP_S, Felt, bent, unbroken
+from graphloc.frontends._mount_yaw import FEWEST, HALF_S, STEP_S, Felt, bent, middles_of, unbroken
 from graphloc.frontends._reports import BODY_AXES, Side, VelocityReport
 from graphloc.frontends._topic_data import TopicData
 from graphloc.signals.series import integral
@@ -85,7 +85,7 @@ def _side_by(felt: Felt, at: Array, ways: list[tuple[Array, NDArray[np.complex12
         ways: times and positions of the felt motion, of the ways by v_x and by v_y, and of the displacements of points
             a metre above and a metre ahead of the IMU.
     """
-    middle = np.arange(max(felt.t_s[0], at[0]) + half_s, min(felt.t_s[-1], at[-1]) - half_s, STEP_S)
+    middle = middles_of(felt.t_s, at, half_s)
     middle = middle[unbroken(at, middle, half_s)]
     block = np.unique(middle // _BLOCK_S, return_inverse=True)[1]
     if len(middle) * STEP_S < FEWEST * half_s or block[-1] < 3:

@@ -185,6 +185,15 @@ def windows_of(motion: MeasuredMotion) -> tuple[float, ...]:
     return tuple(half_s for half_s in HALF_S if half_s >= _NEARLY * apart_s) or (apart_s,)
 
 
+def middles_of(one_s: Array, other_s: Array, margin_s: float, step_s: float = STEP_S) -> Array:
+    """Return the middles (M,) of windows that both of two series of times cover.
+
+    Args:
+        one_s, other_s: their times, increasing. margin_s: what they must cover to either side of a middle.
+    """
+    return np.arange(max(one_s[0], other_s[0]) + margin_s, min(one_s[-1], other_s[-1]) - margin_s, step_s)
+
+
 def unbroken(times_s: Array, middle_s: Array, half_s: float) -> NDArray[np.bool_]:
     """Return (N,) which windows do not touch a gap of the measurements that is too long for them, see `windows_of`.
 
@@ -210,7 +219,7 @@ def _yaw_by(felt: Felt, motion: MeasuredMotion, half_s: float) -> YawInCraft | N
     t, at = felt.t_s, felt.times_of(motion)
     there = np.interp(at, t, felt.turned)
     way = integral(at, motion.speed_mps * np.exp(1j * there)) if motion.way_m is None else motion.way_m
-    middle = np.arange(max(t[0], at[0]) + half_s, min(t[-1], at[-1]) - half_s, STEP_S)
+    middle = middles_of(t, at, half_s)
     (moved, chord), (f, _) = bent(at, way, middle, half_s), bent(t, felt.way_m, middle, half_s)
     faced = np.exp(1j * np.interp(middle, t, felt.turned))
     good = unbroken(at, middle, half_s) & (motion.attitude is not None or np.abs(chord) > MOVES_M)
@@ -233,7 +242,7 @@ def _yaw_by_tipping(felt: Felt, gyro: Array, motion: MeasuredMotion) -> YawInCra
     its deck: only its rates tell the yaw of a sensor.
     """
     t, at = felt.t_s, felt.times_of(motion)
-    middle = np.arange(max(t[0], at[0]) + _TIPS_S, min(t[-1], at[-1]) - _TIPS_S, 2.0 * _TIPS_S)
+    middle = middles_of(t, at, _TIPS_S, 2.0 * _TIPS_S)
     if motion.attitude is None or len(middle) < FEWEST:
         return None
     attitude = Slerp(at, motion.attitude)

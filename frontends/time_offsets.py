@@ -20,7 +20,7 @@ from graphloc.frontends._clock import (
     most_early_s,
     usual_latency_s,
 )
-from graphloc.frontends._mount_yaw import FEWEST, MOVES_M, STEP_S, Felt, bent, unbroken, windows_of
+from graphloc.frontends._mount_yaw import FEWEST, MOVES_M, STEP_S, Felt, bent, middles_of, unbroken, windows_of
 from graphloc.frontends._topic_data import TopicData
 from graphloc.frontends._turns import without_line
 from graphloc.frontends.turning import Turning
@@ -175,13 +175,12 @@ def motion_time_offset(felt: Felt, motion: MeasuredMotion, most_s: float = FARTH
     """
     if motion.way_m is None:
         return None
-    t, at = felt.t_s, felt.times_of(motion)
+    at = felt.times_of(motion)
     # If the right offset lies beyond the lags that are tried, a lesser peak of the same motion seems clear instead.
     lags = np.arange(-FARTHEST_LATE_S, min(most_s, FARTHEST_LATE_S) + 0.5 * _APART_S, _APART_S)
     lengths = list[_Windows]()
     for half_s in windows_of(motion):
-        margin = half_s + FARTHEST_LATE_S
-        middle = np.arange(max(t[0], at[0]) + margin, min(t[-1], at[-1]) - margin, STEP_S)
+        middle = middles_of(felt.t_s, at, half_s + FARTHEST_LATE_S)
         moved, chord = bent(at, motion.way_m, middle, half_s)
         good = (np.abs(chord) > MOVES_M) & unbroken(at, middle, half_s)
         windows = float(good.sum() * STEP_S / half_s)
@@ -261,8 +260,7 @@ def later_than(fixes: MeasuredMotion, velocity: MeasuredMotion) -> tuple[float, 
     if fixes.way_m is None or velocity.way_m is None:
         return None
     at, there = fixes.t_s, velocity.t_s + (velocity.origin_ns - fixes.origin_ns) / NS_PER_S
-    margin = _CHORD_S + MOST_LATE_S
-    middle = np.arange(max(at[0], there[0]) + margin, min(at[-1], there[-1]) - margin, STEP_S)
+    middle = middles_of(at, there, _CHORD_S + MOST_LATE_S)
     middle = middle[unbroken(at, middle, _CHORD_S) & unbroken(there, middle, _CHORD_S)]
     windows = len(middle) * STEP_S / _CHORD_S
     if windows < FEWEST:
