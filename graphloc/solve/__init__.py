@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from graphloc.build import make_problem, rows_of
+from graphloc.build import Problem, make_problem, rows_of
 from graphloc.config import VesselConfig
 from graphloc.frames import Datum
 from graphloc.graph import Sensor
@@ -58,21 +58,14 @@ def smooth(
 
     def solve(part: Recording, heading: KnownHeading | None) -> Solution:
         begun = config.with_start_heading(None) if heading is None else config.with_start_heading(*heading)
-        whole = make_problem(part, begun, datum, rows, inertial)
+
+        def made(left: Recording) -> Problem:
+            return make_problem(left, begun, datum, rows, inertial)
+
+        whole = made(part)
 
         def solved(slow_steps: bool = True) -> Solved:
-            left, problem, said, price = part, whole, list[str](), 0.0
-            for tried in range(_MOST_TIMES + 1):
-                taken = problem if slow_steps else without_slow_steps(problem)
-                try:
-                    result = solve_batch(taken, progress, doubt_imu=tried < _MOST_TIMES)
-                    break
-                except ImuWrong as wrong:
-                    price += wrong.price(problem)
-                    left, why = left_out(left, wrong.spans)
-                    problem = make_problem(left, begun, datum, rows, inertial)
-                    said.append(why)
-            return Solved(left, result, tuple(said), price)
+            return _without_wrong_imu(part, whole, made, progress, slow_steps=slow_steps)
 
         left, result, said, _ = likelier(solved) if has_slow_steps(whole) else solved()
         solution = make_solution(result.stated, left, result)
@@ -89,6 +82,29 @@ def smooth(
     leg_s, start = config.timeline.leg_s, config.start
     heading = None if start.heading_deg is None else KnownHeading(start.heading_deg, start.heading_sigma_deg)
     return _on_deep_stack(lambda: solve_parts(recording, heading, bridge_s, leg_s, absolute, solve))
+
+
+def _without_wrong_imu(
+    part: Recording, whole: Problem, made: Callable[[Recording], Problem], progress: Progress, *, slow_steps: bool
+) -> Solved:
+    """Solve a part of a run, again and again without the spans in which its IMU turns out to be wrong.
+
+    Args:
+        whole: the problem of all of the part. made: makes that of what is left of it.
+        slow_steps: whether compasses may have parted from the gyroscope within seconds.
+    """
+    left, problem, said, price = part, whole, list[str](), 0.0
+    for tried in range(_MOST_TIMES + 1):
+        taken = problem if slow_steps else without_slow_steps(problem)
+        try:
+            result = solve_batch(taken, progress, doubt_imu=tried < _MOST_TIMES)
+            break
+        except ImuWrong as wrong:
+            price += wrong.price(problem)
+            left, why = left_out(left, wrong.spans)
+            problem = made(left)
+            said.append(why)
+    return Solved(left, result, tuple(said), price)
 
 
 def _with_offsets(solution: Solution, result: BatchResult, probe: Probe) -> Solution:
