@@ -266,7 +266,7 @@ def frozen_fixes_warning(sensor: str, stamps_ns: NDArray[np.int64], bad: NDArray
 
 
 def without_frozen_fixes(
-    recording: Recording, datum: Datum, receivers: Mapping[str, str] = MappingProxyType({})
+    recording: Recording, datum: Datum, receivers: Mapping[str, str]
 ) -> tuple[Recording, list[str]]:
     """Return a recording without what frozen receivers repeat, and a warning on each such receiver.
 
