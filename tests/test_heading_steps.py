@@ -3,6 +3,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,16 @@ from graphloc import app
 from graphloc.config import GnssConfig, VesselConfig
 from graphloc.eval.metrics import errors
 from graphloc.eval.simulate import Scenario, simulate
+from graphloc.factors import INERTIAL, SENSORS
 from graphloc.frames import Array, wrap_angle
 from graphloc.measurements import CompassHeading
+from graphloc.online import OnlineSmoother
 from graphloc.recording import Recording
 from graphloc.replay import replay
 from graphloc.signals.heading_steps import HeadingStepDetector, heading_steps
 from graphloc.solution import Health
-from tests.slowly import with_few_states
+from tests.faults import arrivals_of, feed
+from tests.slowly import simulate_slowly, with_few_states
 
 AT_S, STEP_RAD = 45.0, np.radians(20.0)
 ERRORS: dict[str, Callable[[float], float]] = {  # of the compass, by the time since `AT_S`, s
@@ -27,6 +31,13 @@ ERRORS: dict[str, Callable[[float], float]] = {  # of the compass, by the time s
     "damped": lambda s: -STEP_RAD * np.expm1(-max(s, 0.0)),
     "bridge": lambda s: STEP_RAD * np.exp(-0.5 * ((s - 8.0) / 4.0) ** 2),
 }
+
+
+def with_rtk(config: VesselConfig) -> VesselConfig:
+    gnss = GnssConfig.model_validate(
+        config.sensors["gnss"].model_dump() | {"slow_error": {"horizontal_sigma_m": 0.03, "vertical_sigma_m": 0.03}}
+    )
+    return config.model_copy(update={"sensors": {**config.sensors, "gnss": gnss}})
 
 
 @pytest.mark.parametrize("online", [False, True], ids=["offline", "online"])
@@ -45,10 +56,7 @@ def test_a_compass_that_steps_does_not_take_the_heading_along(online: bool, erro
         return replace(m, yaw_rad=float(m.yaw_rad + ERRORS[error]((m.stamp_ns - begin_ns) * 1e-9 - AT_S)))
 
     recording = replace(run.recording, measurements=tuple(map(turned, run.recording.measurements)))
-    gnss = GnssConfig.model_validate(
-        run.config.sensors["gnss"].model_dump() | {"slow_error": {"horizontal_sigma_m": 0.03, "vertical_sigma_m": 0.03}}
-    )
-    config = run.config.model_copy(update={"sensors": {**run.config.sensors, "gnss": gnss}})
+    config = with_rtk(run.config)
     solution = (replay(recording, config) if online else app.smooth_recording(recording, config)).solution
     track = solution.trajectory
     seen = run.truth.covers(track.stamps_ns) & (track.stamps_ns - begin_ns > 20e9)
@@ -80,6 +88,24 @@ def test_offline_the_other_sensors_tell_whether_the_compass_or_the_gyroscope_is_
     assert np.degrees(np.abs(off.heading_rad)).max() < 15.0  # in the gap, while she turns by 60 deg
     assert any("contradicts the other sensors, which agree" in line for line in solution.stats.warnings)
     assert not any("heading step" in line for line in solution.stats.warnings)
+
+
+def test_a_compass_that_has_stepped_is_not_off_its_mount_after_a_restart(tmp_path: Path) -> None:
+    """By 20 deg: resumed, the estimate was no longer good, as the snapshot had the offset, but not that it came by a step."""
+    rates: dict[str, Any] = {"imu_hz": 50.0, "gnss_hz": 2.0, "compass_hz": 5.0, "pose_hz": 0.0, "gnss_sigma_m": 0.02}
+    run = simulate_slowly(Scenario(path="loops", duration_s=60.0, noise="clean", **rates), 523)
+    begin_ns = int(run.truth.stamps_ns[0])
+    came = [
+        replace(a, m=replace(a.m, yaw_rad=float(a.m.yaw_rad + STEP_RAD)))
+        if isinstance(a.m, CompassHeading) and a.m.stamp_ns - begin_ns > 25e9
+        else a
+        for a in arrivals_of(run)
+    ]
+    path, half = tmp_path / "snapshot.json", sum(a.m.stamp_ns - begin_ns < 45e9 for a in came)
+    for part in (came[:half], came[half:]):
+        fed = feed(OnlineSmoother(with_rtk(run.config), rows=SENSORS, inertial=INERTIAL, snapshot=path), run, part)
+        assert fed.estimates[-1].health is Health.GOOD
+    assert any(event.startswith("resumed from a snapshot") for event in fed.events)
 
 
 HZ = 5.0

@@ -24,6 +24,7 @@ from graphloc.online._setup import Setup
 from graphloc.online._snapshot import Snapshot
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import UnmodelledError
+from graphloc.signals.heading_steps import HeadingStepDetector
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -86,6 +87,7 @@ class PersistentState:
             heading=found.heading,
             agreed_ns=dict(found.agreed_ns),
             odometry=Odometry(found.anchor.stamp_ns, found.p_odom_m, found.R_odom_body),
+            receivers={name: ReceiverDetectors(heading=HeadingStepDetector(stepped=True)) for name in found.stepped},
         )
         for name, set_ns in found.clocks_set_ns.items():
             persistent.clocks[name].set_ns = set_ns
@@ -115,6 +117,7 @@ class PersistentState:
             p_odom_m=self.odometry.p_m,
             R_odom_body=self.odometry.R,
             unmodelled=None if self.unmodelled is None else self.unmodelled.sizes,
+            stepped=frozenset(name for name, receiver in self.receivers.items() if receiver.heading.stepped),
         )
 
     def learns_in_trial(self, since_ns: int) -> Callable[[], None]:

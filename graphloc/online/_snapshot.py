@@ -19,7 +19,7 @@ from graphloc.online._anchor import Anchor
 from graphloc.online._unmeasured_heading import UnmeasuredHeading
 from graphloc.online._unmodelled import ErrorSizes
 
-_VERSION = 12
+_VERSION = 13
 _EVERY_S = 2.0  # lost where the process is killed: short beside the 20 s for which an IMU gap is bridged; a choice
 _MOST_TIMES = 1e4  # factor on a data sheet's noise that no sensor exceeds, not even an IMU on an engine
 
@@ -40,6 +40,7 @@ class Snapshot:
         p_odom_m, R_odom_body: (3,), (3, 3) pose of the body in odom.
         clocks_set_ns: by how much the clocks of sensors have been set (`SensorClock`), by sensor.
         settings: by sensor, the settings that slow states and constants in the anchor are added to (`Setup.settings`).
+        stepped: names of compasses whose headings have stepped: a compass is off its mount by that.
         unmodelled: sizes of `UnmodelledError`; None where no slow error is left out, and the IMU's mount is known
             exactly.
     """
@@ -58,6 +59,7 @@ class Snapshot:
     clocks_set_ns: Mapping[str, int]
     settings: Mapping[str, Any]
     unmodelled: ErrorSizes | None
+    stepped: frozenset[str] = frozenset()
 
     def for_settings(self, now: Mapping[str, Any]) -> Snapshot:
         """Return the snapshot without the slow states, constants and clocks of sensors that are set otherwise now.
@@ -73,9 +75,8 @@ class Snapshot:
             slow={name: known for name, known in self.anchor.slow.items() if name in same},
             constants={of: known for of, known in self.anchor.constants.items() if of[0] in same},
         )
-        return replace(
-            self, anchor=anchor, clocks_set_ns={name: ns for name, ns in self.clocks_set_ns.items() if name in same}
-        )
+        clocks_set_ns = {name: ns for name, ns in self.clocks_set_ns.items() if name in same}
+        return replace(self, anchor=anchor, clocks_set_ns=clocks_set_ns, stepped=self.stepped & same)
 
     def write(self, path: Path) -> None:
         """Replace the file atomically: if the process is killed, the old file or the new one is left.
@@ -96,6 +97,7 @@ class Snapshot:
             "agreed_ns": dict(self.agreed_ns),
             "clocks_set_ns": dict(self.clocks_set_ns),
             "settings": dict(self.settings),
+            "stepped": sorted(self.stepped),
             "odom": [self.p_odom_m.tolist(), self.R_odom_body.tolist()],
             "unmodelled": None if self.unmodelled is None else [of.tolist() for of in self.unmodelled],
         }
@@ -135,6 +137,7 @@ class Snapshot:
             R_odom_body=R,
             clocks_set_ns={str(n): int(ns) for n, ns in raw["clocks_set_ns"].items()},
             settings=dict(raw["settings"]),
+            stepped=frozenset(map(str, raw["stepped"])),
             unmodelled=ErrorSizes(*sizes) if sizes else None,
         )
         if not found._is_sound():

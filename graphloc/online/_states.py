@@ -313,7 +313,9 @@ class States:
     def why_off_mount(self, stream: LiveStream) -> str:
         """Return `judge.health.why_off_mount` of the newest slow state; empty once headings have stepped."""
         key = keys.slow(stream.number, self._problem.timeline.slow_of[self._newest.number])
-        if stream.slow is None or not stream.slow.stepped or stream.jumps or not self._window.is_committed(key):
+        if stream.slow is None or not stream.slow.stepped or stream.receiver.heading.stepped:
+            return ""
+        if not self._window.is_committed(key):
             return ""
         return why_off_mount(stream.name, stream.slow, self._window.values.atVector(key))
 

@@ -144,14 +144,23 @@ def step_warnings(sensor: str, steps: Sequence[HeadingStep]) -> list[str]:
 class HeadingStepDetector:
     """Finds the steps of one compass online, three seconds late.
 
+    Args:
+        stepped: whether headings had stepped before, as in a run that is resumed.
+
     Attributes:
         steps: the last of the steps found since the estimate started.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, stepped: bool = False) -> None:
         self.steps: tuple[HeadingStep, ...] = ()
+        self._stepped = stepped
         self._looked_ns, self._works = 0, False
         self._seen: deque[tuple[int, float, float, float, bool]] = deque(maxlen=_KEPT[0])
+
+    @property
+    def stepped(self) -> bool:
+        """Whether headings have stepped, so that their offset is no mount's."""
+        return self._stepped or bool(self.steps)
 
     @property
     def last_ns(self) -> int | None:
