@@ -540,7 +540,7 @@ def test_turns_of_lidars_at_different_rates(monkeypatch: pytest.MonkeyPatch) -> 
         lambda raw, stamp, name: Cloud(name, stamp, np.ones((1, 3)), np.array([stamp], dtype=np.int64)),
     )  # fmt: skip
     config = AerialConfig(lidars={n: LidarConfig(topic=f"/{n}") for n in ("fast", "slow")})
-    turns = list(scans._turns(Heap(), config, []))  # type: ignore[arg-type]  # noqa: SLF001
+    turns = list(scans._turns(Heap(), config, scans._Heard(config.lidars)))  # type: ignore[arg-type]  # noqa: SLF001
     together = [t for t in turns if len(t.clouds) == 2]
     assert len(together) == 3
     assert max(abs(t.clouds[0].stamp_ns - t.clouds[1].stamp_ns) for t in together) < 0.4 * S

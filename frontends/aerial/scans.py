@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +34,6 @@ class ScanFeed:
 
     Attributes:
         mounts: (t (3,) m, R (3, 3)) in body of each LiDAR, by name.
-        silences: a warning on each LiDAR that was silent for long; grows while turns are read.
 
     Raises:
         InputError: no LiDAR, a missing topic, or a mount without a chain of transforms.
@@ -43,10 +42,15 @@ class ScanFeed:
     def __init__(self, bag: Bag, config: AerialConfig, body_frame: str) -> None:
         self.mounts = _mounts(bag, config, body_frame)
         self._bag, self._config = bag, config
-        self.silences: list[str] = []
+        self._heard = _Heard(config.lidars)
+
+    @property
+    def silences(self) -> list[str]:
+        """A warning on each LiDAR that was silent for long in the turns read so far."""
+        return self._heard.silences
 
     def __iter__(self) -> Iterator[Turn]:
-        return _turns(self._bag, self._config, self.silences)
+        return _turns(self._bag, self._config, self._heard)
 
 
 def check_scans(bags: Bags, config: AerialConfig, folder: Path, body_frame: str, datum: Datum) -> None:
@@ -153,50 +157,58 @@ class _Heard:
     """When each LiDAR was heard last.
 
     Args:
-        names: of the LiDARs. silences: gets a line on each silence of `_SILENT_S` that is over, or that the end leaves.
+        names: of the LiDARs.
     """
 
-    def __init__(self, names: Iterable[str], silences: list[str]) -> None:
-        self._last_ns: dict[str, int | None] = dict.fromkeys(names)
-        self._begin_ns, self._newest_ns, self._silences = 0, 0, silences
+    def __init__(self, names: Iterable[str]) -> None:
+        self._names, self._since_ns = tuple(names), dict[str, int]()
+        self._newest_ns: int | None = None
+        self._longest: dict[str, tuple[int, int]] = {}  # length and begin, ns, of the longest silence
+        self._times: Counter[str] = Counter()
+
+    @property
+    def silences(self) -> list[str]:
+        """A line on each LiDAR that was silent for `_SILENT_S` while another was not."""
+        lines = list[str]()
+        for name, (length_ns, since_ns) in self._longest.items():
+            more = f", and {self._times[name] - 1} times more" if self._times[name] > 1 else ""
+            said = f"was silent for {length_ns / NS_PER_S:.0f} s from {utc_text(since_ns)}{more}"
+            lines.append(f"aerial: LiDAR {name} {said}: scans of the others were matched without it")
+        return lines
 
     def note(self, name: str, stamp_ns: int) -> None:
-        self._begin_ns = self._begin_ns or stamp_ns
-        self._newest_ns = max(self._newest_ns, stamp_ns)
-        self._say(name, stamp_ns)
-        self._last_ns[name] = stamp_ns
+        if self._newest_ns is None or abs(stamp_ns - self._newest_ns) > _MISSED_S * NS_PER_S:
+            # All were silent, or the clock was set: nothing is known of the time between.
+            self.end()
+            self._since_ns = dict.fromkeys(self._names, stamp_ns)
+        self._count(name, stamp_ns)
+        self._newest_ns = self._since_ns[name] = stamp_ns
 
     def end(self) -> None:
-        for name in self._last_ns:
-            self._say(name, self._newest_ns)
+        """Count the silences until now."""
+        for name in self._since_ns:
+            self._count(name, self._newest_ns or 0)
 
     def silent(self, name: str, stamp_ns: int) -> bool:
         """Return whether a LiDAR has not been heard for so long that no turn waits for it."""
-        return stamp_ns - self._since_ns(name) > _MISSED_S * NS_PER_S
+        return stamp_ns - self._since_ns[name] > _MISSED_S * NS_PER_S
 
-    def _since_ns(self, name: str) -> int:
-        last_ns = self._last_ns[name]
-        return self._begin_ns if last_ns is None else last_ns
-
-    def _say(self, name: str, until_ns: int) -> None:
-        since_ns = self._since_ns(name)
-        if until_ns - since_ns > _SILENT_S * NS_PER_S:
-            self._silences.append(
-                f"aerial: LiDAR {name} was silent for {(until_ns - since_ns) / NS_PER_S:.0f} s from {utc_text(since_ns)}: scans of the "
-                "others were matched without it"
-            )
+    def _count(self, name: str, until_ns: int) -> None:
+        length_ns = until_ns - self._since_ns[name]
+        if length_ns > _SILENT_S * NS_PER_S:
+            self._times[name] += 1
+            self._longest[name] = max(self._longest.get(name, (0, 0)), (length_ns, self._since_ns[name]))
 
 
-def _turns(bag: Bag, config: AerialConfig, silences: list[str]) -> Iterator[Turn]:
+def _turns(bag: Bag, config: AerialConfig, heard: _Heard) -> Iterator[Turn]:
     """Yield turns: the newest scan of each LiDAR, once there is one of each within `_TURN_S`.
 
     If a LiDAR is missing, or slower than that, the others form a turn without it.
 
     Args:
-        silences: see `ScanFeed`.
+        heard: is told of each scan.
     """
     names = {lidar.topic: name for name, lidar in config.lidars.items()}
-    heard = _Heard(names.values(), silences)
     frames: dict[str, str] = {}
     turn: dict[str, Cloud] = {}
     now_ns = 0
