@@ -152,6 +152,13 @@ def test_a_collar_is_no_contrast(tmp_path: Path) -> None:
     assert np.ptp(seen) > 100
 
 
+@pytest.mark.parametrize(("kind", "bright"), [("uint8", 40), ("uint16", 1)])
+def test_black_water_is_contrast_where_there_is_no_other(kind: str, bright: int, tmp_path: Path) -> None:
+    """Taken for a collar, it left the contrast of the land alone: a dark picture was not stretched, and one of 16 bits lost all."""
+    dark = utm(tmp_path / "a.tif", lambda grey: colours((bright * (grey > DARK)).astype(kind)))
+    assert np.ptp(around(dark).pixels.astype(int)) > 100
+
+
 def test_a_harbour_between_the_samples_is_seen_around_the_datum(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

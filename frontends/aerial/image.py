@@ -201,18 +201,24 @@ class AerialImage:
         step = contrast / _CONTRAST
         return darkest - _DARKEST * step, darkest + (255.0 - _DARKEST) * step
 
-    def _span(self) -> tuple[float, float]:
+    def _span(self, *, collars: bool = False) -> tuple[float, float]:
         """Return the 2 % and 98 % points, in grey, where there is most to see: in samples all over the image, or around the datum.
 
         A large image may show so much of sea or forest that none of its samples hits the harbour.
+
+        Args:
+            collars: whether black and white count. They do where there is nothing else to see: water may be black.
         """
         over, around = self._samples()
         # By row, as some formats are read from the top: else each sample would be.
         values = {
-            corner: self._grey_at(*corner) for corner in sorted({*over, *around}, key=lambda corner: corner[::-1])
+            corner: self._grey_at(*corner, collars=collars)
+            for corner in sorted({*over, *around}, key=lambda corner: corner[::-1])
         }
         spans = [_span_of([values[corner] for corner in corners]) for corners in (over, around)]
         contrast, near = (brightest - darkest for darkest, brightest in spans)
+        if max(contrast, near) < _NOTHING and not collars and np.issubdtype(self._source.dtypes[0], np.integer):
+            return self._span(collars=True)
         return spans[1] if near > _MISSED * contrast else spans[0]
 
     def _samples(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
@@ -228,10 +234,10 @@ class AerialImage:
             found.append([(int(column), int(row)) for column, row in each])
         return found[0], found[1]
 
-    def _grey_at(self, column: int, row: int) -> Array:
+    def _grey_at(self, column: int, row: int, *, collars: bool) -> Array:
         """Return the grey values (N,) of the pixels of a sample that have data; none if it cannot be read.
 
-        A patch says that, where it matters. Black and white are a collar, or nothing to see.
+        A patch says that, where it matters. Black and white are a collar, or nothing to see, unless `collars` count.
         """
         size = np.minimum(_SAMPLE_PX, [self._source.width - column, self._source.height - row]).tolist()
         window = rasterio.windows.Window(column, row, *size)
@@ -241,7 +247,7 @@ class AerialImage:
         except rasterio.errors.RasterioError:
             return np.zeros(0)
         known &= np.isfinite(bands).all(axis=0)
-        if np.issubdtype(bands.dtype, np.integer):
+        if not collars and np.issubdtype(bands.dtype, np.integer):
             known &= ~(np.isin(bands[0], [0, np.iinfo(bands.dtype).max]) & (bands == bands[0]).all(axis=0))
         values = bands[:, known].astype(np.float64)
         return np.asarray(_GREY @ values if len(values) == 3 else values[0])
