@@ -175,6 +175,20 @@ def test_what_goes_and_comes_back_within_seconds_is_a_step(online: bool) -> None
     assert not steps(np.cumsum(again) / HZ + 0.5 * BRIDGE, again, online=online)
 
 
+@pytest.mark.parametrize("hz", [1, 5, 10, 20])
+@pytest.mark.parametrize("wide_s", [3.0, 4.0, 5.0])
+def test_the_way_back_from_under_a_bridge_is_a_part_of_the_step(wide_s: float, hz: int) -> None:
+    """It was dropped, as it follows the way there: the offset stayed where the bridge had it, the heading up to 9 deg off online."""
+    t = np.arange(0.0, 120.0, 1.0 / hz)
+    turned = np.radians(12.0) * np.clip(t - 20.0, 0.0, 10.0)
+    error = np.radians(20.0) * np.exp(-0.5 * ((t - 70.0) / wide_s) ** 2)
+    heading = turned + error + np.random.default_rng(1).normal(0.0, np.radians(0.5), len(t))
+    stamps_ns, sigma, silent = (t * 1e9).astype(np.int64), np.full(len(t), 0.03), np.zeros(len(t) - 1, dtype=bool)
+    found = heading_steps(stamps_ns, heading, turned, sigma, silent)
+    free = np.any([(stamps_ns >= step.after_ns) & (stamps_ns <= step.until_ns) for step in found], axis=0)
+    assert free[np.abs(np.gradient(error, t)) > np.radians(1.0)].all()
+
+
 @pytest.mark.parametrize("online", [False, True], ids=["offline", "online"])
 @pytest.mark.parametrize("times", [-1.0, 0.0, 0.6, 1.4, 57.3])
 def test_a_gyroscope_that_is_wrong_makes_no_steps(times: float, online: bool) -> None:

@@ -111,7 +111,10 @@ def heading_steps(
     steps = [HeadingStep(at_ns, size, at_ns + settles_ns) for at_ns, size in found.items()]
     for begin_ns, size, end_ns in slow_steps(stamps_ns, off, turned_rad, least, unknown, works=works):
         slow = HeadingStep(max(begin_ns - settles_ns, int(stamps_ns[1])), size, end_ns + settles_ns, at_once=False)
-        if not slow.beside(steps):
+        if steps and not steps[-1].at_once and slow.beside(steps[-1:]):  # as back from under a bridge
+            size = math.copysign(max(abs(steps[-1].size_rad), abs(size)), steps[-1].size_rad)
+            steps[-1] = steps[-1]._replace(size_rad=size, until_ns=slow.until_ns)
+        elif not slow.beside(steps):
             steps.append(slow)
     return sorted(steps)
 
