@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from graphloc import app
-from graphloc.config import GnssConfig, VesselConfig
+from graphloc.config import GnssConfig, TimelineConfig, VesselConfig
 from graphloc.eval.metrics import errors
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
@@ -106,6 +106,23 @@ def test_a_compass_that_has_stepped_is_not_off_its_mount_after_a_restart(tmp_pat
         fed = feed(OnlineSmoother(with_rtk(run.config), rows=SENSORS, inertial=INERTIAL, snapshot=path), run, part)
         assert fed.estimates[-1].health is Health.GOOD
     assert any(event.startswith("resumed from a snapshot") for event in fed.events)
+
+
+def test_a_compass_that_has_stepped_is_not_off_its_mount_in_later_legs() -> None:
+    """Of a run of more than half an hour, none of these was good."""
+    rates: dict[str, Any] = {"imu_hz": 50.0, "gnss_hz": 1.0, "compass_hz": 2.0, "pose_hz": 0.0, "gnss_sigma_m": 0.02}
+    run = simulate(Scenario(path="loops", duration_s=300.0, noise="clean", **rates), 523)
+    begin_ns = int(run.truth.stamps_ns[0])
+    turned = tuple(
+        replace(m, yaw_rad=float(m.yaw_rad + STEP_RAD))
+        if isinstance(m, CompassHeading) and m.stamp_ns - begin_ns > 40e9
+        else m
+        for m in run.recording.measurements
+    )
+    config = with_rtk(run.config).model_copy(update={"timeline": TimelineConfig(rate_hz=1.0, leg_s=100.0)})
+    solution = app.smooth_recording(replace(run.recording, measurements=turned), config).solution
+    assert any("overlapping legs" in line for line in solution.stats.events)
+    assert all(health is Health.GOOD for health in solution.health)
 
 
 HZ = 5.0

@@ -55,6 +55,7 @@ def smooth(
     Raises:
         SolveError: the run cannot be started or solved; the text says why.
     """
+    stepped = set[str]()  # compasses, in what is solved so far: in later legs they are off their mounts
 
     def solve(part: Recording, heading: KnownHeading | None) -> Solution:
         begun = config.with_start_heading(None) if heading is None else config.with_start_heading(*heading)
@@ -68,7 +69,8 @@ def smooth(
             return _without_wrong_imu(part, whole, made, progress, slow_steps=slow_steps)
 
         left, result, said, _ = likelier(solved) if has_slow_steps(whole) else solved()
-        solution = make_solution(result.stated, left, result)
+        solution = make_solution(result.stated, left, result, stepped)
+        stepped.update(stream.name for stream in result.stated.streams if stream.heading_steps)
         solution = replace(solution, stats=replace(solution.stats, warnings=(*said, *solution.stats.warnings)))
         if probe is None:
             return solution

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,13 @@ from graphloc.time import duration_ns
 from graphloc.trajectory import Trajectory
 
 
-def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[str]:
-    """Return, by state, the reason why it cannot be called good; empty where there is none."""
-    if throughout := _misfit_of_run(problem, result, stats):
+def misfits(problem: Problem, result: BatchResult, stats: SolveStats, stepped: Collection[str] = ()) -> list[str]:
+    """Return, by state, the reason why it cannot be called good; empty where there is none.
+
+    Args:
+        stepped: names of the compasses whose headings have stepped in an earlier part of the run.
+    """
+    if throughout := _misfit_of_run(problem, result, stats, stepped):
         return [throughout] * len(problem.timeline.stamps_ns)
     said = _beside_jumps(problem)
     receivers: dict[str, list[Stream]] = {}
@@ -36,7 +40,7 @@ def misfits(problem: Problem, result: BatchResult, stats: SolveStats) -> list[st
     return said
 
 
-def _misfit_of_run(problem: Problem, result: BatchResult, stats: SolveStats) -> str:
+def _misfit_of_run(problem: Problem, result: BatchResult, stats: SolveStats, stepped: Collection[str]) -> str:
     """Return the reason why no state of the run can be called good; empty if there is none."""
     if not result.converged:
         return "the solver did not converge"
@@ -48,7 +52,7 @@ def _misfit_of_run(problem: Problem, result: BatchResult, stats: SolveStats) -> 
             sigma_s = float(stream.slow.sigma[stream.slow.late or 0])
             if abs(late_s / sigma_s) > FAR_OFF:
                 return why_late(stream.name)
-        if stream.slow is not None and not stream.heading_steps:
+        if stream.slow is not None and not stream.heading_steps and stream.name not in stepped:
             value = result.values.atVector(keys.slow(stream.number, 0))
             if why := why_off_mount(stream.name, stream.slow, value):
                 return why

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -57,11 +57,14 @@ class _States(NamedTuple):
     gyro_cov: Array
 
 
-def make_solution(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
+def make_solution(
+    problem: Problem, recording: Recording, result: BatchResult, stepped: Collection[str] = ()
+) -> Solution:
     """Return the solution of a run.
 
     Args:
         problem: with the noise as configured. recording: what was measured. result: of the solver.
+        stepped: as of `misfits`.
     """
     known = result
     result, unsaid = _without_drift(known)
@@ -74,7 +77,7 @@ def make_solution(problem: Problem, recording: Recording, result: BatchResult) -
     health, reasons = health_over_time(
         trajectory,
         of_receivers(since, problem.config),
-        misfits(problem, result, stats),
+        misfits(problem, result, stats, stepped),
         problem.config.output.good_bound_m,
     )
     ledger = ledger_of(problem, recording, result.verdicts)
