@@ -19,7 +19,7 @@ from graphloc.frontends._contents import Contents
 from graphloc.frontends._receivers import Late, receiver_of
 from graphloc.frontends._reports import CompassReport, ImuReport, filtered
 from graphloc.frontends._topic_data import TopicData
-from graphloc.frontends._turns import SCATTERED, scattered, wander_deg
+from graphloc.frontends._turns import SCATTERED, deviation_deg, scattered, wander_deg
 from graphloc.frontends.msgtypes import IMU, NUMBERS, QUATERNION
 from graphloc.frontends.time_offsets import heading_time_offset
 from graphloc.frontends.turning import Turning, against_turning
@@ -122,7 +122,7 @@ def _without_echoes(compasses: Sequence[_Heading]) -> list[_Heading]:
 
 
 def _beside_gyro(heading: _Heading, best: Inertial) -> CompassReport:
-    """Return the report with the wander and the number of scattered headings, beside the gyroscope of the best IMU.
+    """Return the report with wander, deviation and the number of scattered headings, beside the gyroscope of the best IMU.
 
     A heading that wanders too far, though on the whole it turns as the gyroscope does, is a course over ground: it
     follows the vessel sideways, and is arbitrary at rest. A compass that hangs for a while is still a heading.
@@ -136,7 +136,7 @@ def _beside_gyro(heading: _Heading, best: Inertial) -> CompassReport:
         for s, y in zip(stamps, wrap_angle(in_enu(angle, report.convention)), strict=True)
     ]
     bad, wander = scattered(best.series, measured), wander_deg(best.series, measured)
-    report = replace(report, wander_deg=wander)
+    report = replace(report, wander_deg=wander, deviation_deg=deviation_deg(best.series, measured))
     left_out = bad | _held(best.felt.turning, stamps, angle)
     most = [m for m, off in zip(measured, left_out, strict=True) if not off]
     steady_deg = min(wander or 0.0, wander_deg(best.series, most) or 0.0)

@@ -227,7 +227,10 @@ def _error_lines(compass: CompassReport) -> list[str]:
         ]
         why = "a heading of GNSS; 0.5 for a magnetic compass"
     else:
-        lines = ["  deviation_sigma_deg: 1.5  # guess: a magnetic compass; 0 for a GNSS compass"]
+        sigma, seen = CompassConfig().deviation_sigma_deg, "a magnetic compass; 0 for a GNSS compass"
+        if compass.deviation_deg is not None and compass.deviation_deg > sigma:
+            sigma, seen = compass.deviation_deg, "as it varies with the heading beside the gyro: iron near it; swing it"
+        lines = [f"  deviation_sigma_deg: {sigma:.1f}  # guess: {seen}"]
         why = "passing errors near iron; 0.2 for a GNSS compass"
     if wander > max(_WANDER_DEG, _LARGER * usual):
         usual, why = wander, "as it wanders beside the gyro; iron near it, or its own filter"

@@ -284,6 +284,7 @@ class CompassReport:
         samples: number of courses compared. why: the judgement in words. unit: of bare numbers; else None.
         like: an orientation of the same device that says the same; else ''.
         wander_deg: wander of its error beside the gyroscope, 1 sigma in a minute; None if that is not told.
+        deviation_deg: magnetic deviation beside the gyroscope, as `deviation_sigma_deg` counts it; None if that is not told.
         two_antennas: whether a GNSS receiver says it, by its sentence, its topic, or as an Imu with an orientation
             alone.
         late_s: what should be added to its stamps by the gyroscope, s, and 1 sigma; None if that is not told. All other
@@ -307,6 +308,7 @@ class CompassReport:
     leeway_deg: float | None = None
     one_way: bool = False
     wander_deg: float | None = None
+    deviation_deg: float | None = None
     two_antennas: bool = False
     late_s: tuple[float, float] | None = None
     late_with_fixes: bool = False

@@ -46,6 +46,7 @@ compared; correlation time to which the wander refers."""
 _BENDS, _BENDS_S = 0.5, 180.0
 """The wander about a parabola is taken if it is below this share of that about a line, in a run of at least this time:
 three correlation times of a wander."""
+_DEVIATES = 3.0  # a deviation is told if it is larger than so many times what a wander makes of it
 # Least wrong scale that is said: ranges of a gyroscope differ by a factor of 2, a compass in iron turns a third too
 # much.
 _SCALE = 1.6
@@ -237,6 +238,66 @@ def wander_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | No
 
 def _wander_beside(imu: ImuSeries, headings: Sequence[CompassHeading], degree: int) -> float | None:
     """Return the wander of `wander_deg`, with a polynomial of a degree removed from each block; None without blocks."""
+    beside = _beside_by_cells(imu, headings, degree)
+    if beside is None:
+        return None
+    blocks, bends, design, apart = beside
+    parts = [len(cells) for cells, _ in blocks]
+    left = np.split(apart - design @ np.linalg.lstsq(design, apart, rcond=1e-6)[0], np.cumsum(parts)[:-1])
+    soon, late = (_squared_steps(blocks, left, round(lag_s / _CELL_S)) for lag_s in _LAGS_S)
+    grown = max(late - soon, 0.0)
+    wander = float(np.degrees(np.sqrt(0.5 * grown / (_LAGS_S[1] - _LAGS_S[0]) * _MINUTE_S)))
+    cells = [own for own, _ in blocks]
+    by_steps = grown / _grown_of_unit(cells, _left_of_unit(cells, design))
+    # A real wander scatters about the polynomials as much as it should. A periodic error scatters less, and its steps
+    # are not compensated for a removal.
+    off_bend = apart - bends @ np.linalg.lstsq(bends, apart, rcond=1e-6)[0]
+    left_of_unit = np.concatenate([cov.diagonal() for cov in _left_of_unit(cells, bends)])
+    by_spread = float((off_bend**2).mean() / left_of_unit.mean())
+    return max(wander, float(np.degrees(np.sqrt(min(by_steps, by_spread)))))
+
+
+def deviation_deg(imu: ImuSeries, headings: Sequence[CompassHeading]) -> float | None:
+    """Return the magnetic deviation that a compass shows beside the gyroscope, as `deviation_sigma_deg` counts it.
+
+    That is the size of one coefficient: of B and C (sine and cosine of the heading) the root mean square, of D and E
+    (twice the heading) twice that. The coefficients are those of the parts that `wander_deg` removes. A wander of the
+    compass, of `WANDERS_DEG` at least, makes them uncertain, the more so where the headings do not go round.
+
+    Args:
+        imu: the samples. headings: of one compass, converted as configured.
+
+    Returns:
+        None where neither pair is clear of that.
+    """
+    wander, beside = wander_deg(imu, headings), _beside_by_cells(imu, headings, 1)
+    if wander is None or beside is None:
+        return None
+    blocks, _, design, apart = beside
+    inverse = np.linalg.pinv(design, rcond=1e-6)
+    cut = np.cumsum([len(cells) for cells, _ in blocks])[:-1]
+    parts = zip((cells for cells, _ in blocks), np.split(inverse, cut, axis=1), strict=True)
+    cov = sum(g @ np.exp(-_CELL_S / _MINUTE_S * np.abs(own[:, None] - own)) @ g.T for own, g in parts)
+    sigmas_deg = max(wander, WANDERS_DEG) * np.sqrt(np.diagonal(cov)[-4:])
+    found = []
+    for size_deg, sigma_deg, share in zip(
+        np.degrees(inverse[-4:] @ apart).reshape(2, 2), sigmas_deg.reshape(2, 2), (1.0, 0.5), strict=True
+    ):
+        if rms(size_deg) > _DEVIATES * rms(sigma_deg):
+            found.append(rms(size_deg) / share)
+    return max(found, default=None)
+
+
+def _beside_by_cells(
+    imu: ImuSeries, headings: Sequence[CompassHeading], degree: int
+) -> tuple[list[tuple[NDArray[np.intp], Array]], Array, Array, Array] | None:
+    """Return heading minus integrated rate, averaged over cells, and what may explain it; None without blocks.
+
+    Returns:
+        blocks: of each its cell numbers (n,), and the columns (n, k) of its own. bends: (N, b) polynomials of all blocks.
+        design: (N, b + 6) these, turn, rate, and sine and cosine of the heading and of twice the heading.
+        apart: (N,) heading minus integrated rate, rad.
+    """
     blocks, first = [], degree + 1  # index of the first column after the polynomial's
     for _, turned, yaw, at_s in _blocks(imu, _said(headings), _WANDER_BLOCK_S):
         cell = ((at_s - at_s[0]) // _CELL_S).astype(int)
@@ -253,22 +314,10 @@ def _wander_beside(imu: ImuSeries, headings: Sequence[CompassHeading], degree: i
         blocks.append((there, np.column_stack(means)))
     if not blocks:
         return None
-    parts = [len(cells) for cells, _ in blocks]
     common = np.vstack([np.delete(columns[:, first:], 2, axis=1) for _, columns in blocks])
     bends = block_diag(*(columns[:, :first] for _, columns in blocks))
     apart, design = np.concatenate([columns[:, first + 2] for _, columns in blocks]), np.hstack([bends, common])
-    left = np.split(apart - design @ np.linalg.lstsq(design, apart, rcond=1e-6)[0], np.cumsum(parts)[:-1])
-    soon, late = (_squared_steps(blocks, left, round(lag_s / _CELL_S)) for lag_s in _LAGS_S)
-    grown = max(late - soon, 0.0)
-    wander = float(np.degrees(np.sqrt(0.5 * grown / (_LAGS_S[1] - _LAGS_S[0]) * _MINUTE_S)))
-    cells = [own for own, _ in blocks]
-    by_steps = grown / _grown_of_unit(cells, _left_of_unit(cells, design))
-    # A real wander scatters about the polynomials as much as it should. A periodic error scatters less, and its steps
-    # are not compensated for a removal.
-    off_bend = apart - bends @ np.linalg.lstsq(bends, apart, rcond=1e-6)[0]
-    left_of_unit = np.concatenate([cov.diagonal() for cov in _left_of_unit(cells, bends)])
-    by_spread = float((off_bend**2).mean() / left_of_unit.mean())
-    return max(wander, float(np.degrees(np.sqrt(min(by_steps, by_spread)))))
+    return blocks, bends, design, apart
 
 
 def _left_of_unit(cells: Sequence[NDArray[np.intp]], design: Array) -> list[Array]:

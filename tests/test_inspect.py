@@ -903,6 +903,25 @@ def test_a_compass_is_drafted_as_far_as_it_wanders(topic: str, swing_deg: float,
         assert compass.wander_sigma_deg == (0.2 if gnss else 0.5)
 
 
+@pytest.mark.parametrize("iron_deg", [0.0, 12.0])
+def test_a_compass_is_drafted_with_the_deviation_that_the_gyroscope_shows(iron_deg: float, tmp_path: Path) -> None:
+    """12 deg x sin(heading) was drafted as 1.5 deg; online the heading was then 16 deg off while it stated 8."""
+    make = Messages(2)
+    items: list[Item] = []
+    for name, at, m in drive(make, seconds=240):
+        if name == "/compass":
+            half = np.arctan2(m.quaternion.z, m.quaternion.w)
+            half += np.radians(iron_deg) * np.cos(2.0 * half) / 2.0
+            items.append((name, at, make.compass(at, (0, 0, np.sin(half), np.cos(half)))))
+        else:
+            items.append((name, at, m))
+    _, config, text = look(tmp_path, items, make)
+    compass = config.sensors["compass"]
+    assert isinstance(compass, CompassConfig)
+    assert ("varies with the heading beside the gyro" in text) is (iron_deg > 0.0)
+    assert compass.deviation_sigma_deg == pytest.approx(iron_deg / np.sqrt(2.0) or 1.5, abs=1.0 if iron_deg else 0.0)
+
+
 @pytest.mark.parametrize(("moves", "usable"), [(True, True), (False, False)])
 def test_a_heading_receiver_that_publishes_an_imu_message_is_not_frozen(
     moves: bool, usable: bool, tmp_path: Path

@@ -19,6 +19,7 @@ from graphloc.frontends._assess import courses_of_fixes
 from graphloc.frontends._run_warnings import _turn_warnings
 from graphloc.frontends._turns import (
     Yaws,
+    deviation_deg,
     pose_turn_warning,
     refuse_unit,
     scale_warning,
@@ -140,6 +141,33 @@ def test_most_of_a_wander_is_told_in_a_short_run(run: SimulatedRun) -> None:
     found = [wander_deg(imu, wandering(short, 5.0, 60.0, seed)) for seed in range(12)]
     rms = float(np.sqrt(np.mean(np.square([v for v in found if v is not None]))))
     assert 0.65 * 5.0 < rms < 1.25 * 5.0  # the less of two estimates
+
+
+def test_iron_that_turns_with_the_vessel_is_measured(run: SimulatedRun) -> None:
+    """B of 12 deg is 12 / sqrt(2) as the size of either of B and C; D gets half of the key's sigma."""
+    imu, headings = of(run)
+
+    def iron(size_deg: float, times: float) -> list[CompassHeading]:
+        return changed(headings, lambda yaw: yaw + np.radians(size_deg) * np.sin(times * yaw))
+
+    assert deviation_deg(imu, iron(12.0, 1.0)) == pytest.approx(8.5, abs=0.5)
+    assert deviation_deg(imu, wandering(iron(12.0, 1.0), 1.5, 20.0)) == pytest.approx(8.5, abs=1.5)
+    assert deviation_deg(imu, iron(4.0, 2.0)) == pytest.approx(5.7, abs=0.5)
+
+
+def test_what_is_no_deviation_is_not_taken_for_it(run: SimulatedRun) -> None:
+    """Noise, a wander, the gyro's scale, late stamps; and headings that hardly turn, of which no deviation is told."""
+    imu, headings = of(run)
+    scaled = replace(imu, gyro_radps=1.02 * imu.gyro_radps)
+    late = [replace(m, stamp_ns=m.stamp_ns + S // 2) for m in headings]
+    said = [
+        (imu, headings),
+        (imu, wandering(headings, 3.0, 100.0)),
+        (scaled, headings),
+        (imu, late),
+        (imu, headings[:60]),
+    ]
+    assert [deviation_deg(samples, yaws) for samples, yaws in said] == [None] * len(said)
 
 
 @pytest.mark.parametrize(("wander_deg_", "low", "high"), [(0.0, 0.0, 0.5), (3.0, 2.0, 3.6)])
