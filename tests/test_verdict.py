@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from graphloc import app
-from graphloc.config import AerialConfig, AprilTagConfig
+from graphloc.config import AerialConfig, AprilTagConfig, BodyVelocityConfig
 from graphloc.eval.calibrate import Calibration, Check, Suggestion
 from graphloc.eval.ekf import FilterResult
 from graphloc.eval.late_check import _late_velocity
@@ -62,6 +62,30 @@ def moved(track: Trajectory, share: float, by_m: float) -> Trajectory:
     p = track.p_world_m.copy()
     p[: round(share * len(p)), 0] += by_m
     return replace(track, p_world_m=p, v_world_mps=None)
+
+
+@pytest.mark.parametrize(
+    ("share", "enabled", "topic", "said"),
+    [
+        (0.5, False, "/dvl", True),
+        (0.02, False, "/dvl", False),
+        (0.5, True, "/dvl", False),
+        (0.5, False, "/other", False),  # the bag has none
+    ],
+)
+def test_a_recorded_speed_that_is_switched_off_is_named_where_fixes_fail(
+    data: ReportData, share: float, *, enabled: bool, topic: str, said: bool
+) -> None:
+    """A robot under water was lost for 66 % of a run online, its Doppler log drafted as switched off, and nothing said so."""
+    n = len(data.solution.health)
+    dark = round(share * n)
+    health = (Health.DEAD_RECKONING,) * dark + (Health.GOOD,) * (n - dark)
+    row = LedgerRow(seq=-1, stamp_ns=0, sensor="", topic="/dvl", outcome=Outcome.IGNORED, count=1750)
+    solution = replace(data.solution, health=health, ledger=Ledger([*data.solution.ledger, row]))
+    log = BodyVelocityConfig(kind="body_velocity", topic=topic, enabled=enabled)
+    config = data.config.model_copy(update={"sensors": {**data.config.sensors, "log": log}})
+    offline, _ = verdict(replace(data, solution=solution, config=config)).tracks
+    assert any("set sensors.log.enabled" in r.text for r in offline.reasons) is said
 
 
 @pytest.mark.parametrize(

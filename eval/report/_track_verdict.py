@@ -37,6 +37,7 @@ _TOO_SURE = 4.0  # NEES from which bounds are too small: errors are 1.4 times wh
 # Least share of the time in which the online 95 % bounds hold the offline position. Honest bounds do for at least 95 %,
 # as the offline track is better informed.
 _HOLDS_OFFLINE = 0.9
+_ALONG = "body_velocity"
 _BESIDE_GNSS, _FEWEST_USED = ("pose", "aerial", "apriltag"), 10
 _GUESS = 0.25  # share of a bound, above which a guess (95 %) makes a part of it that matters; a choice
 # A receiver contradicts the track if half of its fixes are farther away than the larger of these:
@@ -106,7 +107,7 @@ def track_verdict(data: ReportData, solution: Solution) -> TrackVerdict:
         solution: one of `data.solutions`.
     """
     reasons = (
-        *_doubted(solution), *_bounds(solution), *_coverage(data, solution), *_heading_coverage(data, solution),
+        *_doubted(solution), *_bounds(solution), *_switched_off(data, solution), *_coverage(data, solution), *_heading_coverage(data, solution),
         *_far_from_fixes(data, solution), *_late(data, solution), *_levers(data, solution), *_origins(data, solution),
         *_beside(data, solution), *_from_offline(data, solution), *_compared(data, solution), *_solved(data, solution),
     )  # fmt: skip
@@ -129,6 +130,23 @@ def _bounds(solution: Solution) -> Iterator[Reason]:
         trust=Trust.WITH_CARE if doubtful else Trust.YES,
         text=f"Its 95 % bound is {bound:.2f} m or less for 95 % of the run. Health: {said_of(solution)}.",
     )
+
+
+def _switched_off(data: ReportData, solution: Solution) -> Iterator[Reason]:
+    """Yield the wheels or logs that the bag has but that are switched off, where no position was measured for long."""
+    called = shares(solution)
+    without = called.get(Health.DEAD_RECKONING, 0.0) + called.get(Health.LOST, 0.0)
+    if without <= _LOST or data.config.of_kind(_ALONG):
+        return
+    there = {row.topic for row in solution.ledger}
+    off = [name for name, s in data.config.sensors.items() if s.kind == _ALONG and not s.enabled and s.topic in there]
+    if off:
+        names = " or ".join(f"sensors.{name}.enabled" for name in off)
+        yield Reason(
+            trust=Trust.YES,
+            text=f"For {percent(without)} of the run it was by dead reckoning or lost, while a speed along the vessel was recorded, which holds the track "
+            f"there: set {names}.",
+        )
 
 
 def _coverage(data: ReportData, solution: Solution) -> Iterator[Reason]:
