@@ -36,7 +36,7 @@ def choose_datum(recording: Recording, config: VesselConfig, rows: Sequence[Sens
     found = fixes_of(recording)
     fixes = np.array([m.position for m in found][:5])
     if not len(fixes):
-        raise InputError(f"{recording.source}: {_why_no_fix(recording, config)}")
+        raise InputError(f"{recording.source}: {why_no_fix(recording, config)}")
     fixes[:, 1] = continuous_longitudes(fixes[:, 1])
     lat, lon = (float(v) for v in np.median(fixes[:, :2], axis=0))
     heights = [m.position.height_m for m in found if m.has_height][:5]
@@ -64,7 +64,8 @@ def refuse_far_fixes(recording: Recording, datum: Datum) -> None:
             )
 
 
-def _why_no_fix(recording: Recording, config: VesselConfig) -> str:
+def why_no_fix(recording: Recording, config: VesselConfig) -> str:
+    """Return why no origin can be taken from the fixes of a recording that has none: what became of their messages."""
     receivers = config.of_kind("gnss")
     if not receivers:
         return f"no GNSS sensor to take a datum from{_why_no_receiver(recording, config)}"

@@ -27,6 +27,7 @@ from graphloc.judge.warnings import disagreement_warning, joint_rejection_warnin
 from graphloc.ledger import Ledger, LedgerRow, Outcome
 from graphloc.measurements import ImuSample, Measurement, TagSighting
 from graphloc.online import OnlineSmoother
+from graphloc.origin import fixes_of, why_no_fix
 from graphloc.recording import Recording
 from graphloc.solution import Cause, Solution, SolveStats
 from graphloc.time import NS_PER_S, stamps_of
@@ -208,8 +209,9 @@ def replay(
         if interrupted:
             raise KeyboardInterrupt
         lost = recording.lost(config.of_kind("imu"))
+        why = f"; {why_no_fix(recording, config)}" if config.datum is None and not fixes_of(recording) else ""
         raise SolveError(
-            f"{recording.source}: never started: still waiting for {waiting or 'IMU data'}{_apart(recording, config)}{lost}"
+            f"{recording.source}: never started: still waiting for {waiting or 'IMU data'}{why}{_apart(recording, config)}{lost}"
         )
     recording = with_busy_warning(gathering.recording(), config)
     return _result(session, recording, config, begin_ns, interrupted=interrupted)

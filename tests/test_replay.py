@@ -20,6 +20,7 @@ from graphloc.estimate import Event
 from graphloc.eval.metrics import compare_to_truth
 from graphloc.eval.simulate import Scenario, SimulatedRun, bl_scenario, simulate
 from graphloc.gather import Gathering, _live, with_busy_warning
+from graphloc.ledger import LedgerRow, Outcome
 from graphloc.measurements import GnssPosition, ImuSample, PoseFix
 from graphloc.replay import Replayed, _timed, arrivals, replay
 from graphloc.solution import Cause, HealthReason
@@ -122,6 +123,26 @@ def test_a_run_that_never_starts_says_what_it_waited_for(run: SimulatedRun) -> N
     alone = without.where(lambda m: m.sensor == "compass")
     with pytest.raises(SolveError, match="waiting for a position"):
         replay(alone, run.config)
+
+
+def test_a_run_without_a_usable_fix_says_what_became_of_them(run: SimulatedRun) -> None:
+    """`smooth` said that the map grid is not named; `replay` of the same bag, only that it waited for three fixes."""
+    why = "a position in a map grid: set grid to its name"
+    lost = [
+        LedgerRow(seq=m.seq, stamp_ns=m.stamp_ns, sensor=m.sensor, topic="/utm", outcome=Outcome.MALFORMED, reason=why)
+        for m in run.recording.of(GnssPosition)
+    ]
+    without = run.recording.where(lambda m: not isinstance(m, (GnssPosition, PoseFix)))
+    without = replace(without, rows=(*without.rows, *lost))
+    config = run.config.model_copy(
+        update={
+            "datum": None,
+            "truth_topic": None,
+            "sensors": {n: s for n, s in run.config.sensors.items() if s.kind in ("imu", "gnss", "compass")},
+        }
+    )
+    with pytest.raises(SolveError, match=f"waiting for .*fixes.*: {len(lost)} messages of gnss: {why}"):
+        replay(without, config)
 
 
 def test_ctrl_c_keeps_what_there_is(run: SimulatedRun) -> None:
