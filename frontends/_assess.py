@@ -7,7 +7,7 @@ Every result is a guess with its evidence in words; `draft_config` writes down t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ from graphloc.frontends._fixes import RTK_SIGMA_M, radians_warning, scatter_m, s
 from graphloc.frontends._reports import GnssReport, PartOfFixes, TopicReport, Vec, of_nmea
 from graphloc.frontends._sanity import far_fixes_of, lone_fixes
 from graphloc.frontends._topic_data import TopicData
-from graphloc.frontends.msgtypes import IMU, PLACES, UNSTAMPED
+from graphloc.frontends.msgtypes import IMU, PLACES, PLAIN_POSE, POSE, QUATERNION, UNSTAMPED
 from graphloc.measurements import GnssPosition, world_from_fixes
 from graphloc.signals.frozen_receiver import frozen_fixes, frozen_fixes_warning
 from graphloc.signals.white_noise import white_noise
@@ -29,6 +29,7 @@ from graphloc.time import NS_PER_S, stamps_of
 _MOST, _ONE_WAY_RAD = 0.8, np.radians(30.0)  # so many courses lie so near to their mean where they go one way; a choice
 _NEARLY_RAD = np.radians(45.0)  # the same, of half of them
 _WINDOW_S, _FAST_MPS = 1.0, 2.0
+_TURNS = 3  # fewest distinct orientations of poses that turn
 _EITHER = 0.01  # least share of RTK fixes, and of others, of a receiver that has RTK by turns
 STATUS_NAMES = {-1: "no fix", 0: "fix", 1: "sbas", 2: "gbas"}
 
@@ -136,6 +137,22 @@ def topic_report(stream: TopicData, count: int) -> TopicReport:
         latency_s=vec(latency),
         drift_ppm=stream.drift_ppm,
     )
+
+
+def as_heading(stream: TopicData) -> TopicData:
+    """Return poses that tell a heading alone as bare orientations: their place never changes, while they turn.
+
+    So some drivers say the heading of two antennas or of a gyrocompass. Any other stream is returned as it is.
+    """
+    if stream.msgtype not in (POSE, PLAIN_POSE) or not len(stream):
+        return stream
+    places, quaternions = stream.rows[:, :3], stream.rows[:, 3:7]
+    stands = bool(np.isnan(places).all() or not np.ptp(places, axis=0).any())
+    if not stands or len(np.unique(quaternions[attitudes(quaternions)], axis=0)) < _TURNS:
+        return stream
+    rows = quaternions.copy()
+    rows.flags.writeable = False
+    return replace(stream, msgtype=QUATERNION, _rows=rows)
 
 
 def attitudes(quaternions: Array) -> NDArray[np.bool_]:

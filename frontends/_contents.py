@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from graphloc.frontends._assess import evenly, on_one_clock, without_drift
+from graphloc.frontends._assess import as_heading, evenly, on_one_clock, without_drift
 from graphloc.frontends._clock import (
     FEWEST_STAMPS,
     GAIN_LIMIT_S,
@@ -102,7 +102,7 @@ def contents_of(bags: Bags | Bag) -> Contents:
         source, topics, warnings = bag.name, bag.topics, [*bag.warnings, *filter(None, [tree.damage])]
     streams, said_of_recorder = _steadily_recorded(streams)
     streams, said_of_leaps = _without_leaps(streams)
-    streams = [evenly(s) if s.msgtype == IMU and len(s) else s for s in without_drift(streams)]
+    streams = [evenly(s) if s.msgtype == IMU and len(s) else as_heading(s) for s in without_drift(streams)]
     for stream in streams:
         if stream.msgtype == IMU:
             refuse_woven(stream.topic, stream.stamps_ns, stream.logs_ns, stream.tuples, stream.files)

@@ -186,6 +186,12 @@ def _heading_quaternion(msg: Any, config: CompassConfig) -> SaidHeading | Reject
     return _heading(msg.quaternion, 0.0, config)
 
 
+def _heading_pose(msg: Any, config: CompassConfig) -> SaidHeading | Rejection:
+    """Read the orientation of a pose; its position is not used."""
+    variance = float(_covariance_of(msg.pose)[5, 5])
+    return _heading(getattr(msg.pose, "pose", msg.pose).orientation, variance, config)
+
+
 def _heading_imu(msg: Any, config: CompassConfig) -> SaidHeading | Rejection:
     if msg.orientation_covariance[0] == -1.0:
         return rejected("the driver says that the orientation is absent (orientation_covariance[0] = -1)")
@@ -333,6 +339,7 @@ STANDARD: dict[tuple[str, str], Reader] = {
     **{("gnss", msgtype): _place_grid for msgtype in (ODOMETRY, POSE, PLAIN_POSE)},
     ("compass", QUATERNION): _heading_quaternion,
     ("compass", IMU): _heading_imu,
+    **{("compass", msgtype): _heading_pose for msgtype in (POSE, PLAIN_POSE)},
     **{("compass", msgtype): _heading_nmea for msgtype in NMEA},
     **{("compass", msgtype): _heading_number for msgtype in NUMBERS},
     **{("gnss_velocity", msgtype): _velocity for msgtype in (TWIST, PLAIN_TWIST, VECTOR)},

@@ -903,6 +903,35 @@ def test_a_compass_is_drafted_as_far_as_it_wanders(topic: str, swing_deg: float,
         assert compass.wander_sigma_deg == (0.2 if gnss else 0.5)
 
 
+@pytest.mark.parametrize(
+    ("covariance", "place", "alone"), [(False, "none", True), (True, "none", True), (False, "moves", False)]
+)
+def test_poses_that_stay_at_one_place_while_they_turn_are_a_heading(
+    covariance: bool, place: str, alone: bool, tmp_path: Path
+) -> None:
+    """The heading of two antennas, sent as a PoseStamped, was left out as 'not a pose of this vessel'."""
+    make = Messages(2)
+    items: list[Item] = []
+    for name, at, m in drive(make, seconds=60):
+        if name == "/compass":
+            q, east = m.quaternion, (at - START_NS) / S if place == "moves" else 0.0
+            cov = np.diag([0.0] * 5 + [1e-4]).ravel() if covariance else None
+            items.append(("/gps/heading", at, make.pose(at, (east, 0, 0), (q.x, q.y, q.z, q.w), cov)))
+        else:
+            items.append((name, at, m))
+    _, config, text = look(tmp_path, items, make)
+    assert ("compass" in config.sensors) is alone
+    if alone:
+        assert "left out" not in text
+        compass = config.sensors["compass"]
+        assert isinstance(compass, CompassConfig)
+        assert (compass.topic, compass.convention) == ("/gps/heading", "ned")
+        recording = read_recording(tmp_path / "run", config)
+        said = recording.of(CompassHeading)
+        assert len(said) > 100
+        assert {round(float(np.degrees(m.sigma_rad)), 2) for m in said} == {0.57 if covariance else compass.sigma_deg}
+
+
 @pytest.mark.parametrize("iron_deg", [0.0, 12.0])
 def test_a_compass_is_drafted_with_the_deviation_that_the_gyroscope_shows(iron_deg: float, tmp_path: Path) -> None:
     """12 deg x sin(heading) was drafted as 1.5 deg; online the heading was then 16 deg off while it stated 8."""

@@ -168,7 +168,7 @@ class GnssConfig(SensorConfig):
 
 
 class CompassConfig(SensorConfig):
-    """Heading: `geometry_msgs/QuaternionStamped`, orientation of `sensor_msgs/Imu`, NMEA (as `gnss`), `std_msgs/Float64` or `Float32`."""
+    """Heading: `geometry_msgs/QuaternionStamped`, orientation of `sensor_msgs/Imu`, `PoseStamped` or `PoseWithCovarianceStamped`, NMEA (as `gnss`), `std_msgs/Float64` or `Float32`."""
 
     apart_ns = LEAST_APART_NS
 
