@@ -11,8 +11,8 @@ the vessel passes, or by the compass's own filter. If deviation or wander of som
 second seem certain: the heading is wrong by half of them, and true aerial matches are rejected.
 
 yaw(R) = atan2(R10, R00); its derivative by theta in R <- R Exp(theta): `_yaw_jacobian`. GTSAM has no factor of yaw and offset, so
-this one is linearised at every pass (`graphloc.linear`). Yaw is nearly linear in a correction: at 3 deg of roll and pitch, one of
-5 deg is wrong by 0.02 deg. Not handled: pitch near +-90 deg.
+this one is linearised at every pass (`graphloc.linear`), online without the slope of the deviation (`_slope`). Yaw is nearly linear in a
+correction: at 3 deg of roll and pitch, one of 5 deg is wrong by 0.02 deg. Not handled: pitch near +-90 deg.
 """
 
 from __future__ import annotations
@@ -78,8 +78,14 @@ def _read(at: Attachment, config: CompassConfig, yaw: float) -> tuple[float, Arr
 
 
 def _slope(at: Attachment, config: CompassConfig, yaw: float) -> float:
-    """Return the derivative of the reading by yaw."""
-    if at.slow_value is None:
+    """Return the derivative of the reading by yaw: 1 and that of the deviation.
+
+    Online it is 1. Readings tell no heading beyond what is known of A: a heading that is off by as much as A, with B to E
+    turned by that, reads the same. Derivatives that are taken at one estimate of B to E and kept while these change
+    contradict each other in that direction, and together they seem to tell the heading (see `online._constants`): of a
+    compass with a mount good to 10 deg and a deviation of 8.5 deg to 2 deg, from 10 s on, where the vessel goes straight.
+    """
+    if at.slow_value is None or at.T_solver is not None:
         return 1.0
     s, c = math.sin(yaw), math.cos(yaw)
     slopes = np.array([0.0, -s, c, 2.0 * (c * c - s * s), 4.0 * s * c, 0.0])[_sigmas(config) > 0.0]
