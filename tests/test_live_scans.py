@@ -17,7 +17,7 @@ from graphloc import app
 from graphloc.blocks import MountConfig
 from graphloc.config import AerialConfig, LidarConfig
 from graphloc.frames import Array, Datum, Geodetic
-from graphloc.frontends import decode
+from graphloc.frontends import msgtypes
 from graphloc.frontends.aerial import live, match_bag, scans
 from graphloc.frontends.aerial.cloud import CLOUD, Cloud, level
 from graphloc.frontends.aerial.live import LiveMatcher, Matched
@@ -468,7 +468,7 @@ def turns_of(
     def header_stamp_ns(t: float) -> int | None:
         return None if np.isnan(t) else BEGIN + round(t * 1e9)
 
-    monkeypatch.setattr(decode, "header_stamp_ns", header_stamp_ns)
+    monkeypatch.setattr(msgtypes, "header_stamp_ns", header_stamp_ns)
     monkeypatch.setattr(scans, "decode_cloud", decode_cloud)
     mount = MountConfig(tf_frame=mounted) if mounted else MountConfig()
     config = AerialConfig(lidars={n: LidarConfig(topic=f"/{n}", mount=mount) for n in lidars}, stamps=stamps)
