@@ -29,6 +29,7 @@ from graphloc.measurements import CompassHeading
 
 _FLOOR_RAD = np.radians(0.05)  # no compass is better, whatever it says
 _DEVIATION = ("B", "C", "D", "E")
+_CALIBRATED_DEG = 0.1  # sigma of a mount that was calibrated: it may still be turned by a step, as beside iron
 _SHARES = (1.0, 1.0, 0.5, 0.5)  # B and C come of permanent magnetism; D and E, of soft iron, are smaller
 
 
@@ -39,7 +40,7 @@ def _sigmas(config: CompassConfig) -> Array:
 
 @lru_cache
 def _sigmas_of(mount_deg: float, deviation_deg: float, wander_deg: float) -> Array:
-    sigmas = np.radians([mount_deg, *(deviation_deg * share for share in _SHARES), wander_deg])
+    sigmas = np.radians([max(mount_deg, _CALIBRATED_DEG), *(deviation_deg * share for share in _SHARES), wander_deg])
     sigmas.setflags(write=False)
     return sigmas
 
@@ -110,12 +111,10 @@ def residuals(m: CompassHeading, config: CompassConfig, at: Attachment) -> tuple
     )
 
 
-def slow(config: CompassConfig) -> SlowProcess | None:
-    """Return the process of mount offset, deviation and wander, as configured; None if none is modelled."""
+def slow(config: CompassConfig) -> SlowProcess:
+    """Return the process of mount offset, deviation and wander, as configured."""
     sigma, time_constant_s = _sigmas(config), np.array([np.inf] * 5 + [config.wander_time_constant_s])
     there = sigma > 0.0
-    if not there.any():
-        return None
     return SlowProcess(
         name="compass offset",
         axes=tuple(np.array(["yaw", *_DEVIATION, "wander"])[there].tolist()),
@@ -123,9 +122,9 @@ def slow(config: CompassConfig) -> SlowProcess | None:
         scale=np.full(int(there.sum()), 180.0 / np.pi),
         sigma=sigma[there],
         time_constant_s=time_constant_s[there],
-        no_tails=_DEVIATION,
+        no_tails=_DEVIATION if config.mount_offset_sigma_deg > 0.0 else ("yaw", *_DEVIATION),
         # Iron that is moved on board, or a wrong fix of a GNSS compass, adds a constant.
-        stepped=("yaw",) if there[0] else ("wander",),
+        stepped=("yaw",),
     )
 
 

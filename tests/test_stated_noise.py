@@ -2,6 +2,7 @@
 """Sensors that are noisier than they state: that is not the IMU's fault, unless they are its own samples."""
 
 import re
+from collections.abc import Collection
 from dataclasses import replace
 
 import gtsam
@@ -200,9 +201,9 @@ def test_a_compass_that_went_round_by_whole_turns_comes_back() -> None:
     run = simulate(replace(bl_scenario(1, "clean"), duration_s=20.0, imu_hz=50.0, gnss_hz=2.0, compass_hz=2.0), 3)
     run, found = slowly(run, 2.5), list[BatchResult]()
 
-    def keep(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
+    def keep(problem: Problem, recording: Recording, result: BatchResult, stepped: Collection[str]) -> Solution:
         found.append(result)
-        return make_solution(problem, recording, result)
+        return make_solution(problem, recording, result, stepped)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(solve, "make_solution", keep)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a slow GNSS error that nothing tells from motion does to heading and velocity: in their bounds, and not more than that."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 import numpy as np
@@ -96,7 +96,7 @@ def both_ways(recording: Recording, config: VesselConfig) -> tuple[Solution, Sol
     """A run solved once: with the drift taken back, and as the fixes were followed."""
     found: list[Solution] = []
 
-    def twice(problem: Problem, recording: Recording, result: BatchResult) -> Solution:
+    def twice(problem: Problem, recording: Recording, result: BatchResult, _stepped: Collection[str]) -> Solution:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(_solution, "with_drift_taken_back", lambda result: result)
             found.append(_solution.make_solution(problem, recording, result))

@@ -143,7 +143,7 @@ def slow_step(
 
 def after_step(slow: SlowProcess, key: int, value: Array) -> Iterator[Any]:
     """Yield the prior of the constants that a step has moved, re-weighted at a value (k,): many come back from where they went."""
-    moved = slow.jump_axes & slow.constant
+    moved = slow.jump_axes & slow.constant & ~_with_no_tails(slow)
     if moved.any():
         yield _prior(key, np.where(moved, slow.sigma * _tails(slow, value), _NOTHING * slow.sigma))
 

@@ -183,7 +183,7 @@ class CompassConfig(SensorConfig):
     use_reported_sigma: bool = True
     """Use the yaw variance of an `Imu` message, or the accuracy in a maker's message, if it is positive and finite."""
     mount_offset_sigma_deg: NonNegative = 1.0
-    """Unknown constant heading offset of the mount, 1 sigma, deg. 0: it was calibrated; iron turns the compass nevertheless (`deviation_sigma_deg`, `wander_sigma_deg`)."""
+    """Unknown constant heading offset of the mount, 1 sigma, deg. 0: it was calibrated, to 0.1 deg; iron turns the compass nevertheless (`deviation_sigma_deg`, `wander_sigma_deg`)."""
     deviation_sigma_deg: NonNegative = 1.5
     """Magnetic deviation: coefficients B and C (sine and cosine of the heading), 1 sigma, deg; D and E (twice the
     heading) get half of it. 0: none, e.g. a GNSS compass."""
