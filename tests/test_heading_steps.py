@@ -41,8 +41,13 @@ def with_rtk(config: VesselConfig) -> VesselConfig:
 
 
 @pytest.mark.parametrize("online", [False, True], ids=["offline", "online"])
-@pytest.mark.parametrize("error", ERRORS)
-def test_a_compass_that_steps_does_not_take_the_heading_along(online: bool, error: str) -> None:
+@pytest.mark.parametrize(
+    ("error", "mount_deg"), [*((error, None) for error in ERRORS), ("at once", 0.0)], ids=[*ERRORS, "calibrated"]
+)
+def test_a_compass_that_steps_does_not_take_the_heading_along(
+    online: bool, error: str, mount_deg: float | None
+) -> None:
+    """Nor where its mount was calibrated: iron may turn it nevertheless."""
     rates: dict[str, Any] = {"imu_hz": 50.0, "gnss_hz": 5.0, "compass_hz": 5.0, "pose_hz": 0.0, "gnss_sigma_m": 0.02}
     path: Any = (
         "entry" if error == "bridge" else "loops"
@@ -57,6 +62,9 @@ def test_a_compass_that_steps_does_not_take_the_heading_along(online: bool, erro
 
     recording = replace(run.recording, measurements=tuple(map(turned, run.recording.measurements)))
     config = with_rtk(run.config)
+    if mount_deg is not None:
+        compass = config.sensors["compass"].model_copy(update={"mount_offset_sigma_deg": mount_deg})
+        config = config.with_sensors({"compass": compass})
     solution = (replay(recording, config) if online else app.smooth_recording(recording, config)).solution
     track = solution.trajectory
     seen = run.truth.covers(track.stamps_ns) & (track.stamps_ns - begin_ns > 20e9)
