@@ -4,7 +4,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from graphloc import app
 from graphloc.config import GnssConfig, TimelineConfig, VesselConfig
+from graphloc.errors import SolveError
 from graphloc.eval.metrics import errors
 from graphloc.eval.simulate import Scenario, simulate
 from graphloc.factors import INERTIAL, SENSORS
@@ -22,6 +24,7 @@ from graphloc.recording import Recording
 from graphloc.replay import replay
 from graphloc.signals.heading_steps import HeadingStepDetector, heading_steps
 from graphloc.solution import Health
+from graphloc.solve._slow_steps import likelier
 from tests.faults import arrivals_of, feed
 from tests.slowly import simulate_slowly, with_few_states
 
@@ -96,6 +99,31 @@ def test_offline_the_other_sensors_tell_whether_the_compass_or_the_gyroscope_is_
     assert np.degrees(np.abs(off.heading_rad)).max() < 15.0  # in the gap, while she turns by 60 deg
     assert any("contradicts the other sensors, which agree" in line for line in solution.stats.warnings)
     assert not any("heading step" in line for line in solution.stats.warnings)
+
+
+@pytest.mark.parametrize(
+    ("with_steps", "without", "taken"),
+    [
+        ((True, 5.0), (True, 6.0), "with"),
+        ((True, 6.0), (True, 5.0), "without"),
+        ((False, 5.0), (True, 6.0), "without"),  # what has not converged is no solution
+        ((True, 6.0), (False, 5.0), "with"),
+        ((True, np.nan), (True, 6.0), "without"),
+        (None, (True, 6.0), "without"),
+    ],
+)
+def test_of_two_solutions_the_likelier_that_converged_is_taken(
+    with_steps: tuple[bool, float] | None, without: tuple[bool, float], taken: str
+) -> None:
+    def solve(slow_steps: bool) -> Any:
+        one = with_steps if slow_steps else without
+        if one is None:
+            raise SolveError("planted")
+        return SimpleNamespace(
+            result=SimpleNamespace(converged=one[0]), cost=one[1], name="with" if slow_steps else "without"
+        )
+
+    assert cast("Any", likelier(solve)).name == taken
 
 
 def test_a_compass_that_has_stepped_is_not_off_its_mount_after_a_restart(tmp_path: Path) -> None:

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+
 from graphloc.build import Problem
 from graphloc.errors import SolveError
 from graphloc.recording import Recording
@@ -55,7 +57,7 @@ def without_slow_steps(problem: Problem) -> Problem:
 
 
 def likelier(solve: Callable[[bool], Solved]) -> Solved:
-    """Return the run as solved with slow steps, or without, whichever is more probable.
+    """Return the run as solved with slow steps, or without, whichever is more probable; one that converged goes before one that did not.
 
     Args:
         solve: solves the run; whether with slow steps.
@@ -71,4 +73,4 @@ def likelier(solve: Callable[[bool], Solved]) -> Solved:
             failed.append(error)
     if not found:
         raise failed[0]
-    return min(found, key=lambda solved: solved.cost)
+    return min(found, key=lambda solved: (not solved.result.converged, np.nan_to_num(solved.cost, nan=np.inf)))
