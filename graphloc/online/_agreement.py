@@ -180,6 +180,11 @@ class Agreement:
         longer_s = (end_ns - begin_ns - (now_ns - self._jumped_ns)) * 1e-9
         return float(expit(-longer_s / MEAN_S))
 
+    @property
+    def denied(self) -> bool:
+        """Whether the absolute sensors disagree with the estimate at present."""
+        return len(self._refused) >= _FEW and any(in_a_row >= _DENIES for in_a_row in self._denied.values())
+
     def lost_s(self, now_ns: int) -> float:
         """Return for how long (s) the absolute sensors have disagreed with the estimate; 0 while it is not lost.
 
@@ -187,7 +192,7 @@ class Agreement:
         last. That is longer, the longer the level before the jump was held (`_JUMPED_S`).
         """
         seconds = self._timeline.seconds
-        if len(self._refused) >= _FEW and any(in_a_row >= _DENIES for in_a_row in self._denied.values()):
+        if self.denied:
             denied_s = seconds(now_ns) - seconds(self._refused[0])
             if denied_s > _LOST_S:
                 return denied_s

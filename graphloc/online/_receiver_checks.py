@@ -139,10 +139,15 @@ class ReceiverChecks:
         self._warnings += jump_warnings(stream.name, *found, allowed=allowed, followed=not allowed)
 
     def _check_heading(self, stream: LiveStream, stamp_ns: int, at: Attachment, hint: Hint) -> None:
-        """Look for a step of the headings that the gyroscope does not show; the window is rebuilt with it."""
+        """Look for a step of the headings that the gyroscope does not show; the window is rebuilt with it.
+
+        Not while the absolute sensors deny the estimate: the turn is about its vertical, and a window that is rebuilt
+        again and again never restarts.
+        """
         detector, links = stream.receiver.heading, self._problem.links
         first_ns, last_ns, turned_rad = self._problem.timeline.stamps_ns.kept[0], detector.last_ns, None
-        if last_ns is not None and first_ns <= last_ns < stamp_ns and not silent_within(links, last_ns, stamp_ns):
+        follows = last_ns is not None and first_ns <= last_ns < stamp_ns and not self._agreement.denied
+        if last_ns is not None and follows and not silent_within(links, last_ns, stamp_ns):
             turn = links.integrate(last_ns, stamp_ns, self._states.newest.bias).deltaRij()
             turned_rad = float(gtsam.Rot3.Logmap(turn) @ at.T_world_body.rotation().matrix()[2])
         found = detector.note(stamp_ns, hint.yaw_rad, turned_rad, hint.yaw_sigma_rad)
